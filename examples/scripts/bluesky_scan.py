@@ -106,7 +106,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         rig = load_instrument(self.config)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ConfigError(
-                f"{folder} is not an empty folder", "a scan has a folder of its own", "give another one",
+                f"{folder} is not an empty folder", "each scan needs its own folder", "give another one",
                 code=ErrorCode.FILE_EXISTS,
             )  # fmt: skip
         self._place = folder

@@ -81,7 +81,7 @@ def refuse_while_service_runs(instrument: Instrument) -> None:
     if _is_listening(instrument.pi.command_address):
         raise DeviceError(
             f"polysight-pi run serves at {instrument.pi.command_address}",
-            "it holds the lines, the stage and the ports",
+            "it uses the lines, the stage and the ports",
             "use `polysight doctor` on the host, or `sudo systemctl stop polysight-pi`, this command, and"
             " `sudo systemctl start polysight-pi`",
             code=ErrorCode.BUSY,
@@ -104,7 +104,7 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
             if status.state == "fault":
                 raise DeviceError(
                     f"homing failed: {status.reason}",
-                    "the text before says which fault stopped it",
+                    "the text above shows which fault stopped it",
                     "remove the cause, then home again",
                 )
             if status.state != "homing":

@@ -189,7 +189,7 @@ class Executor:
         if not scan_id and has_jog:
             return self._accept()
         if run is None or run.scan_id != scan_id:
-            return make_refusal(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
+            return make_refusal(PiFault.NOT_READY, f"run {scan_id} has not begun", remedy="BeginRun")
         if run.owner != owner:
             return make_refusal(PiFault.NOT_OWNER, f"run {scan_id} belongs to another program")
         self._machine.note_host_alive()
@@ -427,7 +427,7 @@ class Executor:
     def _pulse(self, request: Request, command: m.Pulse) -> None:
         """Pass a burst to the trigger loop; the reply follows when it has been sent."""
         if self._run is not None:
-            summary = f"run {self._run.scan_id} is begun"
+            summary = f"run {self._run.scan_id} has begun"
             raise RefusedError(PiFault.NOT_READY, summary, "pulses would belong to no point", "wait for the scan's end")
         self._machine.require("Pulse")
         if not self._loop.alive:
@@ -437,7 +437,9 @@ class Executor:
             summary = (
                 f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
             )
-            raise RefusedError(PiFault.NOT_READY, summary, "the lines are busy meanwhile", "ask for fewer pulses")
+            raise RefusedError(
+                PiFault.NOT_READY, summary, "the lines are busy during this time", "ask for fewer pulses"
+            )
         self._pulsing.append(request)
         self._loop.send(spec)
 
@@ -458,7 +460,7 @@ class Executor:
             # The host that started the row is lost, or begins its run again: nothing of the row is committed. An abort
             # never ends a row immediately; when it has ended, `_end_row` executes the request.
             self._after_row = request
-            self._machine.handle_event("Abort", f"run {run.scan_id} was begun again")
+            self._machine.handle_event("Abort", f"run {run.scan_id} began again")
         return self._machine.row is not None
 
     def _begin(self, request: Request, run: m.BeginRun) -> None:

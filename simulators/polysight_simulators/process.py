@@ -42,7 +42,7 @@ def check_link(link: Path) -> None:
     """Raise ConfigError if a port cannot get this name: the link to it would replace a file, or a real port."""
     if link.exists() and not link.is_symlink():
         raise ConfigError(
-            f"--link {link}: is there already",
+            f"--link {link}: exists already",
             "the link to the simulated port would replace it",
             "give another name",
             code=ErrorCode.FILE_EXISTS,

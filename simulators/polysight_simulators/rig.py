@@ -321,7 +321,7 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
     """
     folder = folder.resolve()
     if len(str(folder / "wires.sock").encode()) > MAX_SOCKET_PATH:
-        raise ConfigError(f"--dir {folder}: too long a path", "it holds a Unix socket", "choose a shorter one")
+        raise ConfigError(f"--dir {folder}: too long a path", "it contains a Unix socket", "choose a shorter one")
     if options.uno and options.time_scale > UNO_TIME_SCALE:
         raise ConfigError(
             f"--uno with --time-scale {options.time_scale:g}",

@@ -305,7 +305,7 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
     if life is not None and life.killed:
         raise ScanError(
             f"{folder}: no running scan accepts `{command}`", "its program was killed",
-            f"`polysight resume {quote(folder)}`; the stage has stopped by itself", code=ErrorCode.NO_ANSWER,
+            f"`polysight resume {quote(folder)}`; the stage has stopped automatically", code=ErrorCode.NO_ANSWER,
         )  # fmt: skip
     if life is not None and life.doing == "materials":
         raise ScanError(

@@ -48,7 +48,8 @@ _UNTIL_RESUMED = "`polysight resume {folder}`"
 
 _TABLE = (
     # --- before the first row ---
-    State("empty", "wait", "No scan here yet", detail="{folder} holds no scan. This page shows it when one begins.",
+    State("empty", "wait", "No scan here yet",
+          detail="{folder} contains no scan. This page shows a scan when it begins.",
           do="`polysight scan --out {folder}`", never=(_ALL_IS_WELL, _RESULT)),
     State("starting", "wait", "The scan is starting",
           detail="Its program connects to the rig; this takes some seconds.",
@@ -74,7 +75,7 @@ _TABLE = (
           detail="It is held within a row. After more than 2 s the row is retaken.",
           why="A program other than polysight sent the Pi `Hold`", do="That program sends `Resume`; or abort the scan",
           press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _RESULT)),
-    State("pi_silent", "bad", "The Pi is silent", detail="No heartbeat for {since}. The stage stops by itself.",
+    State("pi_silent", "bad", "The Pi is silent", detail="No heartbeat for {since}. The stage stops automatically.",
           why="Network or power of the Pi, or its program ended", do="On the Pi: `systemctl status polysight-pi`",
           press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _RESULT)),
     State("rig_fault", "bad", "The rig has stopped with a fault", detail="{what}", why="{why}", do="{do}",
@@ -96,7 +97,7 @@ _TABLE = (
     # --- ends without being asked ---
     State("failed", "bad", "The scan has failed", detail="{what} {safe}", why="{why}", do="{do}",
           press=BUTTONS_AFTER_END, never=(_ALL_IS_WELL, _RESULT)),
-    State("killed", "bad", "The scan program was killed", detail="{safe} The stage stops by itself.",
+    State("killed", "bad", "The scan program was killed", detail="{safe} The stage stops automatically.",
           why="Its process ended without a message: there was no memory, or somebody killed it", do=_UNTIL_RESUMED,
           press=BUTTONS_AFTER_END, never=(_ALL_IS_WELL, _RESULT)),
     State("frozen", "bad", "The scan program does not respond", detail="No response for {since}; {safe}",

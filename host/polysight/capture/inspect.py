@@ -173,7 +173,7 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], PlacedRecord
     size = int((offsets + sizes).max() - offsets.min())
     if size > _MAX_RECORD_BYTES:
         problem = f"byte counts span {size} bytes"
-        cause = "the file holds more than one record, or corrupted packets"
+        cause = "the file contains more than one record, or corrupted packets"
         raise DataError(problem, cause, "cut the capture to one record", code=ErrorCode.FILE_DAMAGED)
     log = PacketLog(size)
     for packet in packets:
@@ -428,7 +428,7 @@ def _select_from_card(path: Path, card_address: str) -> tuple[CardReport, list[D
             continue
         if card.address not in ("", datagram.source[0]):
             raise DataError(
-                f"{path}: holds packets of {card.address} and {datagram.source[0]}",
+                f"{path}: contains packets of {card.address} and {datagram.source[0]}",
                 "several cards were recorded together",
                 f"choose one: --card {card.address}",
                 code=ErrorCode.VALUES_CONFLICT,

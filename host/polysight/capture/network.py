@@ -435,8 +435,8 @@ def explain_silent_card(board: Board, problem: str, root: Path = _ROOT) -> Devic
         remedy = f"check the card's power, the cable and the LEDs; `ip link show {interface}` must contain LOWER_UP"
     elif hop is Hop.NEIGHBOUR:
         cause = (
-            f"the link is up, but no device has the address {board.card_address}: another card is on this cable, or its"
-            " EEPROM holds another address"
+            f"the link is up, but no device has the address {board.card_address}: another card is on this cable, or "
+            "its EEPROM contains another address"
         )
         remedy = (
             "check card_address in instrument.toml (for a scan to resume: `polysight resume SCAN --config"

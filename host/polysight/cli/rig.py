@@ -410,7 +410,7 @@ def _add_scans(add: AddCommand) -> None:
     sub = add(
         "scan",
         _scan,
-        "scan with the rig and process meanwhile (Ctrl-C: stop after the row; twice: stop now)",
+        "scan with the rig and process at the same time (Ctrl-C: stop after the row; twice: stop now)",
         "polysight scan --config instrument.toml --out scans/one",
     )
     add_config_option(sub)
@@ -425,7 +425,7 @@ def _add_scans(add: AddCommand) -> None:
         "--config",
         type=Path,
         metavar="FILE",
-        help="take [pi], [limits] and the boards' addresses from this rig file from now on (default: the scan's)",
+        help="use [pi], [limits] and the boards' addresses from this rig file from now on (default: the scan's)",
     )
 
     sub = add(

@@ -49,7 +49,7 @@ def print_result(
     if as_json:
         print_json({"file": str(path), "simulated": file.simulated, **to_builtins(file)})
         return 0
-    head_line = "SIMULATED data: of no use for a real rig" if file.simulated else "measured"
+    head_line = "SIMULATED data: not usable for a real rig" if file.simulated else "measured"
     scans = ", ".join(f"{s.scan_id} ({s.rows} rows)" for s in file.sources)
     sys.stdout.write(f"{head_line}: {scans}\n" + "".join(f"  {line}\n" for line in lines))
     sys.stdout.write(f"written: {path}\nnothing else was changed; to use it, in the rig file:\n")

@@ -393,7 +393,7 @@ def _load_rig(config: Path) -> Instrument:
     if not rig.radar.native:
         raise ConfigError(
             f"{config}: no boards under [radar] native",
-            f'control is "{rig.radar.control}": something else configures these radars',
+            f'control is "{rig.radar.control}": another program configures these radars',
             'control = "native", native = { NAME = { usb_serial = "..." } }; see docs/how-to/radar-bring-up.md',
         )
     return rig

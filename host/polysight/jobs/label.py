@@ -124,7 +124,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         return 0
     else:
         sys.stdout.write(_describe_boxes(folder, products, saved_labels, patches))
-        question = "name the patches again, in place of the boxes drawn by hand? type yes: "
+        question = "name the patches again, instead of the boxes drawn by hand? type yes: "
         if saved_labels and ask(question).strip() != "yes":
             raise ConfigError(
                 "nothing was changed", "the answer was not yes", "for options: polysight label --help",

@@ -215,12 +215,12 @@ def _check_new(folder: Path) -> None:
         return
     if (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length:
         raise ConfigError(
-            f"{folder} holds a scan already",
+            f"{folder} already contains a scan",
             "scans are never overwritten",
             f"`polysight resume {quote(folder)}` continues it; or give another --out",
         )
     if not folder.is_dir() or any(p.name not in (MANIFEST, *_ALLOWED_ENTRIES) for p in folder.iterdir()):
-        raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")
+        raise ConfigError(f"{folder} is not an empty folder", "each scan needs its own folder", "give another --out")
 
 
 def scan(

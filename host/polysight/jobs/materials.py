@@ -435,7 +435,7 @@ def _score_models(data: Path, as_json: bool) -> int:
             f"{score_by_pixel.pixels:12.1%}{score_by_pixel.patches:12.1%}\n"
         )
     if missing := scores[0].not_judged:
-        sys.stdout.write(f"not judged with scans left out, because one scan alone holds them: {', '.join(missing)}\n")
+        sys.stdout.write(f"not judged with scans left out, because only one scan contains them: {', '.join(missing)}\n")
     return 0
 
 
@@ -457,7 +457,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
     matched = match_patches(scans)
     if not matched:
         raise DataError(
-            f"{products[-1].folder}: none of its patches lies where one of {products[0].folder} does",
+            f"{products[-1].folder}: none of its patches is at the place of a patch of {products[0].folder}",
             "the object was moved between the scans, or these are scans of other objects",
             "scan the same patches in the same places",
         )

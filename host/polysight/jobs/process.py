@@ -172,7 +172,7 @@ def make_products(
                 raise
             if (out / REPORT).exists():
                 images_note = (
-                    f"{out} holds the earlier products; `polysight image` with another --out writes the images"
+                    f"{out} contains the earlier products; `polysight image` with another --out writes the images"
                 )
                 raise DataError(e.what, e.why, join_advice(e.remedy, images_note), code=e.code) from None
             # Raised below, after the `with`: an error inside it would discard the new images.
@@ -420,7 +420,7 @@ def _check_dropped(pipeline: Pipeline, out: Path) -> None:
     absent = pipeline.quality.coverage().rows_absent
     if absent:
         raise DataError(
-            f"{len(absent)} rows of the scan have no data any more, and {out} holds products made with them",
+            f"{len(absent)} rows of the scan no longer have data, and {out} contains products made with them",
             "their raw data was dropped, and their samples are damaged or missing",
             "give another --out",
             code=ErrorCode.NOT_ENOUGH_DATA,

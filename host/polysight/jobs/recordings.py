@@ -191,7 +191,7 @@ def plot_profile(report: Report, path: Path) -> None:
     from matplotlib.figure import Figure
 
     if not report.profile_db.size:
-        raise DataError(f"{report.path}: no chirp to plot", "the recording holds no data", "record again")
+        raise DataError(f"{report.path}: no chirp to plot", "the recording contains no data", "record again")
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     # The canvas attaches itself to the figure, and draws without a display.
     FigureCanvasAgg(figure)

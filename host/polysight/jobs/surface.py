@@ -135,7 +135,8 @@ def make_surface(data: Path, rig: Path | Instrument | None = None, reference: Pa
     if not len(surface.segment):
         raise DataError(
             f"{data}: none of {len(points)} points lies on a surface",
-            "only edges were seen: the object is too small, turned away, or mirrors to where the stage does not go",
+            "only edges were seen: the object is too small, turned away, or reflects to positions that the stage "
+            "does not reach",
             "turn the object towards the rig; `polysight plan` shows visible normals",
             code=ErrorCode.NO_DATA,
         )
@@ -148,7 +149,7 @@ def check_is_metal(scan: Path, gains: Gains) -> None:
         raise DataError(
             f"{scan}: V is {-gains.v_over_h_db:.0f} dB weaker than H, relative to the direct path",
             "the reference is not of metal, which reflects both equally, or the cable of V is loose",
-            "scan a bare metal sphere or plate that lies alone",
+            "scan a bare metal sphere or plate alone",
             code=ErrorCode.MISMATCH,
         )
 

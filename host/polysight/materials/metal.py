@@ -317,7 +317,7 @@ def find_metal_in_box(
         label = patch.label
     if not mask.any():
         raise DataError(
-            f"the metal box {tuple(round(b, 1) for b in box_mm)} mm holds no valid pixel",
+            f"the metal box {tuple(round(b, 1) for b in box_mm)} mm contains no valid pixel",
             "it lies outside the image; boxes are in millimetres from the image centre",
             "give --metal-box x0,y0,x1,y1 inside the image",
             code=ErrorCode.NO_DATA,
@@ -334,7 +334,7 @@ def take_patch_as_metal(label: int, segmentation: Segmentation) -> MetalReferenc
         if patch.label == label:
             return MetalReference(patch.interior, label, f"given as patch {label}", given=True)
     raise DataError(
-        f"there is no patch {label} to take as metal",
+        f"there is no patch {label} to use as metal",
         f"{len(segmentation.patches)} patches were found",
         "give the number of one of them",
         code=ErrorCode.NO_DATA,

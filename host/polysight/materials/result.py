@@ -39,8 +39,8 @@ STEEP_FINDING = Finding(
 SMEAR = Finding(
     "error",
     "a smear at the end of the scan",
-    "positions without data or with a wrong phase spread plates along x or y, and the correction of the footprint lifts"
-    " what lies at the end of the illuminated area",
+    "positions without data or with a wrong phase spread plates along x or y, and the correction of the footprint "
+    "amplifies the end of the illuminated area",
     "if an object lies there, scan again without gaps",
 )
 """Why a steep patch that is a smear gets no permittivity."""

@@ -108,7 +108,7 @@ class LabelledScan:
         mask[max(min(y0, y1), 0) : max(y0, y1, 0), max(min(x0, x1), 0) : max(x0, x1, 0)] = True
         if not mask.any():
             raise DataError(
-                f"{self.scan}: the box of {name}, {self.boxes[name]}, holds no pixel of the {self.h.shape} image",
+                f"{self.scan}: the box of {name}, {self.boxes[name]}, contains no pixel of the {self.h.shape} image",
                 "the label file is of another scan", "correct the box, or leave the scan out", code=ErrorCode.NO_DATA,
             )  # fmt: skip
         return mask
@@ -257,7 +257,7 @@ class _RestrictedUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """Return the named constructor if `_ALLOWED` has it: those of arrays. Raises UnpicklingError."""
         if (module, name) not in _ALLOWED:
-            raise pickle.UnpicklingError(f"it wants to call {module}.{name}")
+            raise pickle.UnpicklingError(f"it would call {module}.{name}")
         return super().find_class(module, name)
 
 

@@ -211,14 +211,14 @@ def _check_channels(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     if missing:
         names = ", ".join(arrays) or "nothing"
         raise DataError(
-            f"{path}: no {' and no '.join(missing)}; it holds {names}", _EXPECTED_CONTENT,
+            f"{path}: no {' and no '.join(missing)}; it contains {names}", _EXPECTED_CONTENT,
             "save the s-polarised channel as h and the p-polarised one as v", code=ErrorCode.KEY_MISSING,
         )  # fmt: skip
     for name in CHANNEL_ARRAYS:
         array = arrays[name]
         if array.dtype.kind != "c":
             raise DataError(
-                f"{path}: {name} holds {array.dtype}, not complex numbers",
+                f"{path}: {name} contains {array.dtype}, not complex numbers",
                 "the phase between H and V is needed for a permittivity",
                 "save the complex image, not its magnitude", code=ErrorCode.TYPE_WRONG,
             )  # fmt: skip
@@ -259,7 +259,7 @@ def _make_axis(
     if axis.dtype.kind not in "fiu" or axis.shape != (size,):
         raise DataError(
             f"{path}: {name} is {axis.dtype} {_shape(axis)}, the images have {size} pixels along it",
-            "an axis holds one pixel centre, in metres, for each row or column",
+            "an axis has one pixel centre, in metres, for each row or column",
             f"save {name} with {size} numbers, or leave it out", code=ErrorCode.MISMATCH,
         )  # fmt: skip
     values = axis.astype(np.float64)
@@ -321,7 +321,7 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
     is_lit = valid & ((h != 0) | (v != 0))
     if not is_lit.any():
         raise DataError(
-            f"{path}: no pixel holds data", "both channels are zero, or valid is false everywhere",
+            f"{path}: no pixel contains data", "both channels are zero, or valid is false everywhere",
             "look at the program that made the images", code=ErrorCode.NO_DATA,
         )  # fmt: skip
     return is_lit
@@ -544,7 +544,8 @@ def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> l
         cause += "; or the sign is as given, and the metal reference is painted"
     return [reason(
         "care",
-        f"the sign of the phases is not known: taken {treatment}, right with a probability of {1 - other_sign:.2f}",
+        f"the sign of the phases is not known: used {treatment}, which is right with a probability of "
+        f"{1 - other_sign:.2f}",
         cause,
         "save `conjugate` (true or false) with the images: docs/spec/given-images.md", 2.2,
     )]  # fmt: skip

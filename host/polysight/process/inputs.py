@@ -68,7 +68,7 @@ def explain_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) 
     if not known_angles or any(abs(library_angle - angle) <= SAME_ANGLE_DEG for library_angle in known_angles):
         return ""
     return (
-        f"Nothing {verb} named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} holds"
+        f"Nothing {verb} named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} contains"
         f" {' and '.join(f'{a:g}' for a in known_angles)} degrees only (|P| changes by a tenth in a degree)."
         " Train a library at this angle, and process the scan again with --library."
     )

@@ -253,7 +253,7 @@ class KeptSamples:
             if isinstance(source, ScanFolder):
                 remedy = f"`polysight resume {quote(folder)}` records the missing rows"
             raise DataError(
-                f"{folder}: no row is recorded whole",
+                f"{folder}: no recorded row is complete",
                 "the scan was stopped in its first row, or files are missing",
                 remedy,
                 code=ErrorCode.NO_DATA,

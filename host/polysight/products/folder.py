@@ -121,7 +121,7 @@ def check_products_folder(out: Path, scan_id: str) -> None:
     dropped = raw_dropped(out)
     if dropped and dropped.scan_id != scan_id:
         raise ConfigError(
-            f"{out} holds the only products of scan {dropped.scan_id}",
+            f"{out} contains the only products of scan {dropped.scan_id}",
             f"its raw rows were dropped on {dropped.dropped_utc[:10]}, so they cannot be made again",
             "give another --out",
             code=ErrorCode.NAME_TAKEN,
@@ -136,7 +136,7 @@ def check_results_folder(out: Path) -> None:
     require_writable_folder(out.absolute())
     if is_source(out):
         raise ConfigError(
-            f"{out} holds the recorded rows of a scan",
+            f"{out} contains the recorded rows of a scan",
             "results are not written among them",
             f"give a folder of their own: --out {quote(out / 'results')}",
             code=ErrorCode.FILE_EXISTS,

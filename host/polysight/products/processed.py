@@ -144,7 +144,7 @@ def _check_image(arrays: dict[str, npt.NDArray]) -> None:
         raise KeyError("p")
     for name, array in arrays.items():
         if array.dtype.kind not in "cfb":
-            raise ValueError(f"{name} holds {array.dtype}, not numbers")
+            raise ValueError(f"{name} contains {array.dtype}, not numbers")
         if name not in ("x_m", "y_m") and array.shape != shape:
             raise ValueError(f"{name} is {' x '.join(map(str, array.shape))}, x_m and y_m are {shape[0]} x {shape[1]}")
 

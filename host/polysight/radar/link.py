@@ -63,7 +63,7 @@ class UnexpectedRestartError(DeviceError):
 
     def __init__(self, name: str) -> None:
         super().__init__(
-            f"{name}: it restarted by itself",
+            f"{name}: it restarted without a command",
             "a supply that drops when the RF core starts, a loose 5 V plug, or its reset button or line",
             "measure the 5 V of the radar board while it starts; the operation is repeated after a reset",
             code=ErrorCode.RADAR_RESTARTED,

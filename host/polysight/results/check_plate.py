@@ -105,5 +105,5 @@ def check_reasons(result: CheckResult | None) -> list[Finding]:
         f"the check plate {result.name} was measured as {real:.2f}, loss {loss:.2f}, instead of {known_real:.2f}, loss"
         f" {known_loss:.2f}: {result.sigmas:.1f} standard deviations"
     )
-    cause = "three good scans in a thousand are so far off: the rig has changed"
+    cause = "only three good scans in a thousand differ by so much: the rig has changed"
     return [reason("care", problem, cause, remedy, _ACTION_WEIGHT)]

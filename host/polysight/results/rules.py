@@ -173,9 +173,10 @@ def judge_dead_rx(board: str, dead: Mapping[int, Sequence[int]], rows: int) -> l
             some = f" in {len(dead_rows)} of {rows} rows, first in row {dead_rows[0]}"
         reasons.append(reason(
             "care", f"{' and '.join(names)} of {board} {'gives' if len(names) == 1 else 'give'} no signal{some}",
-            "noise only, zeros or less than a hundredth of the others' power: its antenna, mixer or connection is dead;"
-            " the whole image is made of the board's other RX",
-            "the results hold, with more noise; `polysight doctor` shows each RX: reset the board, or replace it", 3.2,
+            "it gives only noise, zeros or less than a hundredth of the others' power: its antenna, mixer or "
+            "connection is dead; the whole image is made from the board's other RX",
+            "the results are valid, with more noise; `polysight doctor` shows each RX: reset the board, or replace "
+            "it", 3.2,
         ))  # fmt: skip
     return reasons
 
@@ -247,7 +248,7 @@ def judge_patches(
     if patches == 0 and filled_share > FILLED_SHARE:
         return [reason(
             "none", f"one region fills {100 * filled_share:.0f} % of the image: no edge of a plate is in it",
-            "a plate as large as the image has nothing beside it from which it could stand out; a table, a wall or "
+            "if a plate is as large as the image, there is no background from which it stands out; a table, a wall or "
             "noise alone look the same, so the region does not count as a patch",
             "image a larger area (image.columns, image.rows), lay a smaller plate, or"
             " draw a box on it (polysight label; process --labels)", 9.0,
@@ -440,7 +441,7 @@ def judge_copies(
         )]  # fmt: skip
     return [reason(
         "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place_text}",
-        "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed equally",
+        "a second path in addition to the direct path (multipath) modulates the scan; the plates are disturbed equally",
         "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.5,
     )]  # fmt: skip
 
@@ -457,7 +458,7 @@ def judge_image_shift(apart_mm: tuple[float, float], has_drift: bool = False) ->
         do = "remove the cause of the drift of the phase first; if this remains, measure where the antennas are"
     return [reason(
         "care",
-        f"the images of H and V lay {distance:.1f} mm apart (x {apart_mm[0]:+z.1f}, y {apart_mm[1]:+z.1f} mm)",
+        f"the images of H and V were {distance:.1f} mm apart (x {apart_mm[0]:+z.1f}, y {apart_mm[1]:+z.1f} mm)",
         cause, do, 1.9,
     )]  # fmt: skip
 
@@ -491,15 +492,16 @@ def judge_fringes(probability: float, has_gaps: bool = False, behind: float = 0.
         )]  # fmt: skip
     if is_known(behind) and behind > BACKGROUND_CARE:
         return [reason(
-            "care", what, "what lies behind the plates shines through them and causes this; a second path causes "
+            "care", what, "objects behind the plates shine through them and cause this; a second path causes "
             "it, too",
-            "cover what lies behind the plates with absorber, or move it 300 mm away", 2.8,
+            "cover objects behind the plates with absorber, or move them 300 mm away", 2.8,
         )]  # fmt: skip
     return [reason(
         "care", what,
-        "a second path beside the direct path (multipath) or an overdriven receiver changes the gains; bright edges of "
+        "a second path in addition to the direct path (multipath) or an overdriven receiver changes the gains; "
+        "bright edges of "
         "the plates, and a table that shines through them, look alike",
-        "take reflectors away from the line between transmitter and receivers; cover what lies behind the plates with "
+        "take reflectors away from the line between transmitter and receivers; cover objects behind the plates with "
         "absorber", 3.0,
     )]  # fmt: skip
 
@@ -513,7 +515,7 @@ def judge_disturbed_plates(errors: Mapping[int, float], has_gaps: bool = False) 
     if not above:
         return []
     patches = f"patch {min(above)}" if len(above) == 1 else f"patches {', '.join(map(str, sorted(above)))}"
-    cause = "they are uneven, or copies of other plates lie there: a second path beside the direct path, or clipping"
+    cause = "they are uneven, or a second path in addition to the direct path, or clipping, lays copies of plates there"
     action = "use even plates; take reflectors away from the line between transmitter and receivers"
     if has_gaps:
         cause = "positions without data lay weak copies of the plates over them"
@@ -531,7 +533,7 @@ def judge_reference_tilt(tilt_deg: tuple[float, float]) -> list[Finding]:
         return []
     return [reason(
         "care", f"the metal plate of the reference scan was tilted by {largest_tilt_deg:+z.1f} degrees",
-        "the polarisation turns with it, in all plates alike, as if the boards had turned; corrected to a quarter",
+        "the polarisation turns with it, in all plates equally, as if the boards had turned; corrected to a quarter",
         "lay the metal plate parallel to the stage, and scan it again", 4.1,
     )]  # fmt: skip
 
@@ -563,7 +565,7 @@ def judge_background(relative_std: float) -> list[Finding]:
     if not is_known(relative_std) or relative_std <= BACKGROUND_CARE:
         return []
     return [reason(
-        "care", f"what lies behind the plates disturbs P by {100 * relative_std:.0f} %, which the error bars contain",
+        "care", f"objects behind the plates disturb P by {100 * relative_std:.0f} %, which the error bars contain",
         "a table, a wall or a holder behind them returns waves too, and they add to those of the plates",
         "cover it with absorber, or move it 300 mm away from the plates", 2.9,
     )]  # fmt: skip
@@ -586,7 +588,8 @@ def judge_flatness(
     if not all(map(is_known, ripple)) or max(ripple) <= RIPPLE_CARE:
         return []
     cause = (
-        "uneven plates or bright edges, a second path beside the direct path, interference, or a small aperture "
+        "uneven plates or bright edges, a second path in addition to the direct path, interference, or a small "
+        "aperture "
         "cause this"
     )
     action = "use even plates; take reflectors away from the line between transmitter and receivers; scan a larger area"
@@ -669,7 +672,7 @@ def judge_brightness(off: Mapping[int, float]) -> list[Finding]:
             reasons.append(reason(
                 "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
                 "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",
-                "fit it as a layer (polysight permittivity --layer), or lay it flat and free", 1.7,
+                "fit it as a layer (polysight permittivity --layer), or lay it flat, without objects near it", 1.7,
             ))  # fmt: skip
     return reasons
 

@@ -241,7 +241,8 @@ async def _read_products(site: Site, request: Request, work: Callable[[Path], T]
             if catalogue.read_generation(read_products(folder).folder) == generation_before:
                 return result
         raise ScanError(
-            "the scan was processed again meanwhile", "another program replaced its products", "load the page again",
+            "the scan was processed again in the meantime", "another program replaced its products", "load the page "
+            "again",
             code=ErrorCode.MISMATCH,
         )  # fmt: skip
 

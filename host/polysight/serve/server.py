@@ -195,7 +195,7 @@ def _check_scan_folder(folder: Path) -> None:
         newest = folder / scans_below[0].name
         remedy += f": polysight preview {quote(newest)}; polysight serve {quote(folder)} shows them all"
     raise DataError(
-        f"{folder}: contains no scan, but {other_files[0]}", "a scan has a folder of its own", remedy,
+        f"{folder}: contains no scan, but {other_files[0]}", "each scan needs its own folder", remedy,
         code=ErrorCode.FILE_FOREIGN,
     )  # fmt: skip
 
@@ -290,8 +290,8 @@ def _bind(address: ServerAddress) -> socket.socket:
         listener.close()
         raise DeviceError(
             f"{address.host}:{address.port} cannot be served: {e.strerror}",
-            "another program holds this port, the address is not this machine's, or the port is below 1024",
-            "give another --port; `ss -ltnp` shows who holds it",
+            "another program uses this port, the address is not this machine's, or the port is below 1024",
+            "give another --port; `ss -ltnp` shows which program uses it",
         ) from None
     return listener
 
@@ -484,7 +484,7 @@ def describe_server(access: Access, what: str, bound: tuple[str, int]) -> str:
     else:
         lines.append("read-only; buttons come with `serve` without --read-only, or `preview` with --control")
     if not ipaddress.ip_address(host).is_loopback:
-        warning = "" if access.secure else "; nothing is encrypted: --certificate and --key do that"
+        warning = "" if access.secure else "; nothing is encrypted; --certificate and --key add encryption"
         lines.append(f"anyone who reaches this machine and has the token can read all scans{warning}")
         if sys.stderr.isatty():
             lines.append(draw_code(addresses[0]))

@@ -321,7 +321,7 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     elif log.damage:
         findings.append(_note(scan_folder.EVENTS, log.damage, _FETCH_REMEDY))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
-        findings.append(_make_error(scan_folder.EVENTS, "holds events of another scan"))
+        findings.append(_make_error(scan_folder.EVENTS, "contains events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
         findings.append(_make_error(scan_folder.EVENTS, "the sequence of the events has gaps"))
     if commits and not is_committed_damage:

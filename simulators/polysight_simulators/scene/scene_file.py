@@ -165,12 +165,12 @@ class Plate(_Table, frozen=True):
     def __post_init__(self) -> None:
         """Check what the types cannot: a name, one kind of material, what goes with it, and the number of facets."""
         _require(self.name.strip() != "" and self.name.isprintable(), "a plate has a name of printable characters")
-        _require(self.strips_deg is None or self.metal, "strips_deg goes with metal = true")
+        _require(self.strips_deg is None or self.metal, "strips_deg needs metal = true")
         kinds = (self.metal, self.permittivity is not None, bool(self.layers))
         _require(sum(kinds) == 1, "a plate has one of permittivity = [..], metal = true or [[plates.layers]]")
         _require(
             self.thickness_mm is None or self.permittivity is not None,
-            "thickness_mm goes with permittivity, not with metal or layers",
+            "thickness_mm is for permittivity, not for metal or layers",
         )
         _require(
             all(layer.thickness_mm is not None for layer in self.layers[:-1]),
@@ -243,7 +243,8 @@ class Shape(_Table, frozen=True):
             self.metal != (self.permittivity is not None), "a shape has one of permittivity = [..] or metal = true"
         )
         _require(
-            self.thickness_mm is None or self.permittivity is not None, "thickness_mm goes with permittivity, not metal"
+            self.thickness_mm is None or self.permittivity is not None,
+            "thickness_mm is for permittivity, not for metal",
         )
         if self.permittivity is not None:
             _check_permittivity(self.permittivity)
@@ -388,7 +389,7 @@ class Scene(_Table, frozen=True):
     def __post_init__(self) -> None:
         for table, kind in _OVERRIDES.items():
             unknown = sorted(set(getattr(self, table)) - set(kind.__struct_fields__))  # type: ignore[attr-defined]
-            _require(not unknown, f"[{table}] holds unknown keys {unknown}; known: {list(kind.__struct_fields__)}")  # type: ignore[attr-defined]
+            _require(not unknown, f"[{table}] contains unknown keys {unknown}; known: {list(kind.__struct_fields__)}")  # type: ignore[attr-defined]
 
     def with_disturbances(self, **changes: Any) -> Scene:
         """Return the scene with some disturbances changed; `ideal=True` switches all off first."""

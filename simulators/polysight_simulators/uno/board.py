@@ -227,7 +227,7 @@ def compile_firmware(compiler: Path | None = None) -> Path:
     if not SKETCH_DIR.is_dir():
         raise DeviceError(
             f"{SKETCH_DIR}: no such folder",
-            "polysight is installed without its repository, which holds the sketch",
+            "polysight is installed without its repository, which contains the sketch",
             "run from a clone of the repository, or use the stage without the emulated board",
         )
     sources = [p for p in SKETCH_DIR.iterdir() if p.suffix in (".cpp", ".h", ".ino", ".mk")]

@@ -18,7 +18,7 @@ const BUTTONS = {
   abort: ["Abort now", "danger", () => confirmAbort(name, (error) => complain("answer", error))],
 };
 const CONTROLS = ["pause", "continue", "stop", "abort"];
-const CURVES = { sync: ["phase left over", "degrees (std)"], snr_db: ["SNR", "dB"], lost: ["lost packets", "%"] };
+const CURVES = { sync: ["remaining phase error", "degrees (std)"], snr_db: ["SNR", "dB"], lost: ["lost packets", "%"] };
 
 let state = null, motion = {}, source = null, heardAt = 0, allNotices = false, toldNotices = "", revision = -1;
 let server = {}, name = scanName, summary = {}, curve = "sync";

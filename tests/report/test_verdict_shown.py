@@ -1,5 +1,9 @@
-"""The report with a verdict: withheld results, ellipses with the right share of points, readable labels."""
+"""The report shows the verdict on a scan, and no results if the verdict withholds them; its figures are readable.
 
+A verdict says if results can be used (levels "good" and "care") or not ("none"). Regions of permittivity are ellipses.
+"""
+
+import itertools
 import json
 from dataclasses import replace
 from html import unescape
@@ -38,66 +42,79 @@ from polysight.results.verdict import LEVELS
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 
 
-def write_products(folder, rows=None) -> ProcessedScan:
-    """Input of the report: names in patches, pixels and truth, and quality.json."""
+def load_result(folder, segments=None) -> ProcessedScan:
+    """The result in the files of a folder with these patches, with names of pixels and a true plate in addition."""
     saved = read_products(folder)
     interior = np.zeros(saved.h.shape, bool)
     interior[5:9, 12:16] = True
     content = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
-    content |= {"segments": rows or make_segments("good"), "library": "Of its materials 1 could not be judged: copper."}
+    content |= {
+        "segments": segments or make_segments("good"),
+        "library": "Of its materials 1 could not be judged: copper.",
+        "pixel_accuracy": 0.5,
+        "model": "knn",
+    }
+    true_plate = TruthPlate("acrylic", box_mm=(-10.0, -20.0, 15.0, 20.0), permittivity=3 - 0.3j)
     return make_result(
         saved.images,
-        {**content, "pixel_accuracy": 0.5, "model": "knn"},
-        json.loads((folder / "quality.json").read_text(encoding="utf-8")),
+        content=content,
+        quality=json.loads((folder / "quality.json").read_text(encoding="utf-8")),
+        # The interior of patch 2 has 16 pixels.
         pixel_names={2: (np.array(["PET"] * 16), interior)},
-        plates=(TruthPlate("acrylic", (-10.0, -20.0, 15.0, 20.0), 3 - 0.3j),),
+        plates=(true_plate,),
     )
 
 
-def collect_texts(make) -> str:
-    """All texts of a figure."""
+def collect_texts(draw_figures) -> str:
+    """All texts that `draw_figures()` writes into axes."""
     collected: list[str] = []
-    plain = Axes.text
-    noted = Axes.annotate
+    original_text = Axes.text
+    original_annotate = Axes.annotate
 
-    def text(self, x, y, s, *a, **k):
+    def text(self, x, y, s, *arguments, **options):
         collected.append(str(s))
-        return plain(self, x, y, s, *a, **k)
+        return original_text(self, x, y, s, *arguments, **options)
 
-    def annotate(self, s, *a, **k):
+    def annotate(self, s, *arguments, **options):
         collected.append(str(s))
-        return noted(self, s, *a, **k)
+        return original_annotate(self, s, *arguments, **options)
 
     with patch.object(Axes, "text", text), patch.object(Axes, "annotate", annotate):
-        make()
+        draw_figures()
     return "\n".join(collected)
+
+
+def cut_head(page: str) -> str:
+    """The first part of a page: title, verdict and its reasons."""
+    after_beginning = page.split("<main>")[1]
+    return after_beginning.split('<ul class="keys">')[0]
 
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
     folder = write_judged_products(tmp_path, level)
     with skip_rendering():
-        page = unescape(write_report(folder, write_products(folder)).read_text(encoding="utf-8"))
-    head = page[page.index("<main>") : page.index('<ul class="keys">')]
+        page = unescape(write_report(folder, load_result(folder)).read_text(encoding="utf-8"))
+    head = cut_head(page)
     assert f'<span class="badge">{LEVELS[level]}</span>' in head
     for part in REASON.values():
         assert (part in head) == (level != "good")
+    # The error budget is on the page for every level.
     assert "estimated from the scene" in page
     assert "+2.4 mm ± 0.3 mm" in page
     assert "54.60° ± 0.12°" in page
 
 
-def test_reasons_of_less_weight_are_folded(tmp_path):
-    """A phone shows three of twenty reasons before a section is opened."""
+def test_the_page_shows_three_reasons_and_the_others_when_a_section_is_opened(tmp_path):
     folder = write_judged_products(tmp_path, "care")
-    verdict = {"level": "care", "reasons": [{**REASON, "what": f"reason {number}"} for number in range(1, 21)]}
+    reasons = [{**REASON, "what": f"reason {number}"} for number in range(1, 21)]
+    verdict = {"level": "care", "reasons": reasons}
     for name in ("quality.json", "materials.json"):
         content = json.loads((folder / name).read_text(encoding="utf-8"))
         (folder / name).write_text(json.dumps({**content, "verdict": verdict}), encoding="utf-8")
     with skip_rendering():
-        page = write_report(folder, write_products(folder)).read_text(encoding="utf-8")
-    head = page[page.index("<main>") : page.index('<ul class="keys">')]
-    visible_part, _, folded_part = head.partition("17 more")
+        page = write_report(folder, load_result(folder)).read_text(encoding="utf-8")
+    visible_part, _, folded_part = cut_head(page).partition("17 more")
     assert "reason 3<" in visible_part
     assert "reason 4<" not in visible_part
     assert '<ol start="4">' in folded_part
@@ -105,22 +122,25 @@ def test_reasons_of_less_weight_are_folded(tmp_path):
 
 
 @pytest.mark.parametrize("keep_withheld", [False, True])
-def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, keep_withheld):
+def test_if_results_are_withheld_page_and_figures_show_images_without_names_and_permittivities(tmp_path, keep_withheld):
+    """With `keep_withheld` the files contain the results nevertheless, as a faulty program could write them."""
     folder = write_judged_products(tmp_path, "none", keep_withheld=keep_withheld)
     with skip_rendering():
-        text = collect_texts(lambda: write_report(folder, write_products(folder)))
-    text += collect_texts(lambda: open_scan(folder).plot())
+        texts_in_figures = collect_texts(lambda: write_report(folder, load_result(folder)))
+    texts_in_figures += collect_texts(lambda: open_scan(folder).plot())
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
-    for part in (text, page[page.index("<main>") :]):
-        assert [word for word in RESULTS if word in part] == []
+    _, shown_page = page.split("<main>")
+    for result in RESULTS:
+        assert result not in texts_in_figures
+        assert result not in shown_page
     figure_names = {path.stem for path in (folder / "figures").iterdir()}
     assert {"amplitude_h", "amplitude_v", "amplitude_p", "phase_p", "materials"} <= figure_names
     assert not {"permittivity", "permittivity_map", "truth"} & figure_names
 
 
-def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path):
+def test_usable_results_are_shown_with_their_errors_and_the_largest_source_of_error(tmp_path):
     folder = write_judged_products(tmp_path, "care")
-    page = unescape(write_report(folder, write_products(folder)).read_text(encoding="utf-8"))
+    page = unescape(write_report(folder, load_result(folder)).read_text(encoding="utf-8"))
     assert "2.90 ± 0.20" in page
     assert "0.20 ± 0.10" in page
     assert "leakage (60 %)" in page
@@ -130,102 +150,140 @@ def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path)
 
 
 def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
-    folder = write_judged_products(tmp_path, None)
+    folder = write_judged_products(tmp_path, level=None)
+    segments_of_earlier_releases = make_segments(level=None)
     with skip_rendering():
-        page = unescape(write_report(folder, write_products(folder, make_segments(None))).read_text(encoding="utf-8"))
+        report = write_report(folder, load_result(folder, segments_of_earlier_releases))
+    page = unescape(report.read_text(encoding="utf-8"))
     assert 'class="verdict' not in page
     assert "Error budget" not in page
     assert "2.90 ± 0.20" in page
     assert make_budget_table(ErrorBudget()) is None
 
 
-def test_the_inner_region_has_the_half_widths_that_hold_68_percent():
-    covariance = [[0.04, 0.012], [0.012, 0.01]]
+def test_the_68_percent_region_has_the_given_half_widths_and_the_correlation_of_the_covariance():
+    std_real = 0.2
+    std_loss = 0.1
+    covariance_of_parts = 0.012
+    covariance = [[std_real**2, covariance_of_parts], [covariance_of_parts, std_loss**2]]
     figures = PermittivityFigures(real=2.9, imag=-0.2, covariance=covariance, half_widths_68=(0.1, 0.08))
-    of_old_products = msgspec.structs.replace(figures, half_widths_68=None)
     inner = region_matrix(figures, 0.68)
     np.testing.assert_allclose(np.sqrt(np.diag(inner)), (0.1, 0.08))
-    np.testing.assert_allclose(inner[0, 1] / (0.1 * 0.08), -0.012 / (0.2 * 0.1))
+    # The loss is minus the imaginary part: the covariance changes its sign.
+    np.testing.assert_allclose(inner[0, 1] / (0.1 * 0.08), -covariance_of_parts / (std_real * std_loss))
     np.testing.assert_array_equal(region_matrix(figures, 0.95), figures.spread.matrix)
-    np.testing.assert_array_equal(region_matrix(of_old_products, 0.68), figures.spread.matrix)
+    # Files of earlier releases have no half widths.
+    without_half_widths = msgspec.structs.replace(figures, half_widths_68=None)
+    np.testing.assert_array_equal(region_matrix(without_half_widths, 0.68), figures.spread.matrix)
 
 
 @pytest.mark.parametrize("share", SHARES)
-@pytest.mark.parametrize("mixed", [0.0, 0.9, -0.7])
-def test_an_ellipse_holds_its_share_of_draws(share, mixed):
+@pytest.mark.parametrize("correlation", [0.0, 0.9, -0.7])
+def test_an_ellipse_contains_its_share_of_a_normal_distribution(share, correlation):
     std = np.array([0.3, 0.05])
-    matrix = np.outer(std, std) * np.array([[1, mixed], [mixed, 1]])
-    width, height, angle = fit_ellipse(matrix, share)
-    draws = np.random.default_rng(5).multivariate_normal([0, 0], matrix, 100_000)
-    turn = np.radians(angle)
-    along = draws @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    inside = (along[:, 0] / (width / 2)) ** 2 + (along[:, 1] / (height / 2)) ** 2 <= 1
-    assert inside.mean() == pytest.approx(share, abs=0.005)
+    matrix = np.outer(std, std) * np.array([[1, correlation], [correlation, 1]])
+    width, height, angle_deg = fit_ellipse(matrix, share)
+    x, y = np.random.default_rng(5).multivariate_normal([0, 0], matrix, 100_000).T
+    # Coordinates along the axes of the ellipse.
+    angle = np.radians(angle_deg)
+    along = x * np.cos(angle) + y * np.sin(angle)
+    across = y * np.cos(angle) - x * np.sin(angle)
+    is_inside = (along / (width / 2)) ** 2 + (across / (height / 2)) ** 2 <= 1
+    # The standard error of a share of 100,000 numbers is 0.0015 at most.
+    assert is_inside.mean() == pytest.approx(share, abs=0.005)
 
 
 def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
-    rows = [
-        {**make_segments("good")[1], "label": 3 * i + k + 1, "name": f"polyethylene, high density, sheet {i} {k}",
-         "box_mm": [16 * k - 24, 16 * i - 24, 16 * k - 10, 16 * i - 10]}
-        for i in range(3) for k in range(3)
-    ]  # fmt: skip
-    scan = replace_results(write_products(write_judged_products(tmp_path, "good"), rows), pixel_names={}, plates=())
+    """Nine patches of 14 mm, 2 mm apart."""
+    _, pet, _ = make_segments("good")
+    segments = []
+    for row in range(3):
+        for column in range(3):
+            left = 16 * column - 24
+            bottom = 16 * row - 24
+            segment = pet | {
+                "label": 3 * row + column + 1,
+                "name": f"polyethylene, high density, sheet {row} {column}",
+                "box_mm": [left, bottom, left + 14, bottom + 14],
+            }
+            segments.append(segment)
+    result = load_result(write_judged_products(tmp_path, "good"), segments)
+    scan = replace_results(result, pixel_names={}, plates=())
     fig = Figure(figsize=(4.6, 4.6), dpi=160, layout="constrained")
     FigureCanvasAgg(fig)
     labels = draw_materials(fig.add_subplot(), scan)
     assert shorten_labels(fig, labels) == labels
     fig.draw_without_rendering()
     boxes = [label.text.get_window_extent() for label in labels]
-    assert not any(Bbox.intersection(a, b) for i, a in enumerate(boxes) for b in boxes[:i])
+    for box, other_box in itertools.combinations(boxes, 2):
+        assert not Bbox.intersection(box, other_box)
     assert draw_permittivity_map(scan) is not None
 
 
-@pytest.mark.parametrize(("out_px", "replaced"), [(-20, 0), (0.9, 0), (1.1, 1)])
+@pytest.mark.parametrize(("px_outside", "names_replaced"), [(-20, 0), (0.9, 0), (1.1, 1)])
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_name_may_leave_the_frame_by_a_pixel(side, out_px, replaced):
+def test_a_name_that_leaves_the_frame_by_more_than_a_pixel_is_replaced_by_a_number(side, px_outside, names_replaced):
     fig = Figure(dpi=100)
     FigureCanvasAgg(fig)
     text = fig.text(0, 0.5, "acrylic", ha=side)
-    inside = 1 if side == "left" else -1
-    x_px = (0.0 if side == "left" else fig.bbox.x1) - inside * out_px
-    text.set_x(x_px / fig.bbox.x1)
-    edge = text.get_window_extent()
-    # Text starts at whole pixels of its own: put its drawn edge where it is meant to be.
-    drawn_px = edge.x0 if side == "left" else edge.x1
-    text.set_x((2 * x_px - drawn_px) / fig.bbox.x1)
-    assert len(shorten_labels(fig, [MapLabel(text, "1", "acrylic", "red")])) == replaced
+    if side == "left":
+        edge_px = -px_outside
+    else:
+        edge_px = fig.bbox.x1 + px_outside
+    text.set_x(edge_px / fig.bbox.x1)
+    # Text is drawn at whole pixels: move it by the difference of its drawn edge from the intended one.
+    drawn_box = text.get_window_extent()
+    drawn_edge_px = drawn_box.x0 if side == "left" else drawn_box.x1
+    text.set_x((edge_px + edge_px - drawn_edge_px) / fig.bbox.x1)
+    label = MapLabel(text, number="1", name="acrylic", colour="red")
+    assert len(shorten_labels(fig, [label])) == names_replaced
 
 
 @pytest.mark.parametrize("names", [1, 2, 3, 8, 30])
-def test_a_legend_takes_just_the_room_below_the_axes(names):
-    """The figure grows by the legend's height; the axes stay as large."""
+def test_a_legend_enlarges_the_figure_by_its_height_and_leaves_the_axes_as_large(names):
     fig = make_figure(5, 4, RIGHT_IN)
     ax = fig.add_subplot()
     ax.set_xlabel("x, mm")
     height_px = ax.get_window_extent().height
-    labels = [MapLabel(ax.text(0.9, 0.0, "polyethylene sheet"), "1", "polyethylene", "red") for _ in range(names)]
+    labels = []
+    for _ in range(names):
+        text = ax.text(0.9, 0.0, "polyethylene sheet")
+        labels.append(MapLabel(text, number="1", name="polyethylene", colour="red"))
     fit_labels(fig, labels, RIGHT_IN)
     fig.draw_without_rendering()
     (legend,) = fig.legends
-    free_px = ax.get_tightbbox().y0 - legend.get_window_extent().y1
-    assert 0 <= free_px < 0.2 * fig.dpi
+    gap_px = ax.get_tightbbox().y0 - legend.get_window_extent().y1
+    # Less than 0.2 inches.
+    assert 0 <= gap_px < 0.2 * fig.dpi
     assert ax.get_window_extent().height == pytest.approx(height_px)
 
 
-def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):
-    scan = write_products(write_judged_products(tmp_path, "good"))
-    p = np.exp(1j * np.radians(np.where(np.arange(30) % 2, 170.0, -170.0)))[None, :] * np.ones((20, 1))
-    limits = find_phase_limits_deg(replace_results(scan, images=replace(scan.images, p=p)))
+def test_the_colours_of_phases_on_both_sides_of_180_degrees_span_these_alone(tmp_path):
+    scan = load_result(write_judged_products(tmp_path, "good"))
+    # 170 and -170 degrees in alternate columns.
+    phases_deg = np.full(scan.p.shape, -170.0)
+    phases_deg[:, 1::2] = 170.0
+    images = replace(scan.images, p=np.exp(1j * np.radians(phases_deg)))
+    limits = find_phase_limits_deg(replace_results(scan, images=images))
     assert limits is not None
     low, high = limits
+    # A range of 20 degrees, and a margin of 15 % of it and of the next multiple of 5 on either side.
     assert high - low < 40
-    assert any(low <= 170 + turn <= high and low <= 190 + turn <= high for turn in (-360, 0))
+    # The range may be a turn lower.
+    assert (low <= 170 and high >= 190) or (low <= 170 - 360 and high >= 190 - 360)
+
+
+def test_phases_without_patches_or_around_the_whole_circle_have_no_range_of_colours(tmp_path):
+    scan = load_result(write_judged_products(tmp_path, "good"))
     assert find_phase_limits_deg(replace_results(scan, materials=None)) is None
-    random = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=p.shape))
-    assert find_phase_limits_deg(replace_results(scan, images=replace(scan.images, p=random))) is None
+    random_p = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=scan.p.shape))
+    assert find_phase_limits_deg(replace_results(scan, images=replace(scan.images, p=random_p))) is None
 
 
 @pytest.mark.parametrize("key", BUDGET)
-def test_an_error_budget_with_a_part_alone_is_shown(key):
+def test_an_error_budget_with_a_single_part_is_shown(key):
     assert make_budget_table(msgspec.convert({key: BUDGET[key]}, ErrorBudget))
+
+
+def test_an_error_budget_says_that_the_plane_is_not_known():
     assert make_budget_table(msgspec.convert({"plane": {"known": False}}, ErrorBudget))

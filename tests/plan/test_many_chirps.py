@@ -1,4 +1,4 @@
-"""Plans for bursts of several chirps a frame, which are kept as they are: only the speed is chosen."""
+"""Plans for bursts with several chirps in a frame: a plan keeps the burst and chooses the speed of the stage alone."""
 
 import msgspec
 

@@ -17,7 +17,7 @@ from polysight.planning import find_scene_warnings, read_scene, warn_of_scene
 from polysight.planning.plan_command import format_rig_lines
 
 OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
-# A scanned area of 360 mm; chosen, so that it has few positions.
+# A scanned area of 360 x 360 mm with few positions.
 GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
 
 
@@ -43,7 +43,7 @@ def test_the_example_scene_needs_no_change():
         # Plates of 45 mm: a gap of 15 mm is too narrow, one of 35 mm is not.
         ([make_plate(-30), make_plate(30)], ["gap"]),
         ([make_plate(-40), make_plate(40)], []),
-        # Side by side in x, but one above the other.
+        # Only 5 mm apart in x, but one above the other.
         ([make_plate(-25, -40), make_plate(25, 40)], []),
         ([make_plate(-60, background=True, side_mm=400.0), make_plate(0)], []),
         # Too narrow in x and in y.
@@ -64,15 +64,17 @@ def test_each_fault_of_a_scene_is_named(tmp_path, plates, expected):
 @pytest.mark.parametrize("axis", ["columns", "rows"])
 def test_one_row_or_column_is_too_small_an_aperture(tmp_path, axis):
     """A single row resolves nothing across it: no size and no gap is large enough."""
-    assert set(list_topics(tmp_path, make_plate(-30), make_plate(30), grid=GRID | {axis: 1})) == {"aperture"}
+    topics = list_topics(tmp_path, make_plate(-30), make_plate(30), grid=GRID | {axis: 1})
+    assert set(topics) == {"aperture"}
 
 
 def test_plan_and_simulate_print_the_warning(tmp_path, capsys):
     path = tmp_path / "scene.toml"
-    plates = [make_plate(-30, metal=True) | {"permittivity": None}, make_plate(30)]
-    del plates[0]["permittivity"]
+    metal_plate = make_plate(-30, metal=True)
+    del metal_plate["permittivity"]
     grid = {"columns": 9, "rows": 9, "step_x_mm": 40.0, "step_y_mm": 40.0}
-    path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "burst": {"pulses": 2}, "plates": plates}))
+    scene = {"name": "plates", "grid": grid, "burst": {"pulses": 2}, "plates": [metal_plate, make_plate(30)]}
+    path.write_text(tomli_w.dumps(scene))
     assert main(["plan", "--scene", str(path)]) == 0
     assert "note, gap:" in capsys.readouterr().out
     assert main(["simulate", str(path), "--out", str(tmp_path / "scan")]) == 0
@@ -85,7 +87,7 @@ def test_plan_and_simulate_print_the_warning(tmp_path, capsys):
 
 
 def test_proposals_are_for_the_scene_and_repeat_its_warnings(tmp_path, capsys):
-    """Apertures of the plan have the same grid; plates are checked in each."""
+    """Each proposed plan scans the area of the scene, and is checked with its plates."""
     path = tmp_path / "scene.toml"
     grid = {"columns": 41, "rows": 21, "step_x_mm": 4.0, "step_y_mm": 4.0}
     path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": [make_plate(-30), make_plate(15)]}))
@@ -93,8 +95,10 @@ def test_proposals_are_for_the_scene_and_repeat_its_warnings(tmp_path, capsys):
     plans = json.loads(capsys.readouterr().out)["plans"]
     assert plans
     for plan in plans:
-        assert (plan["columns"] - 1) * plan["step_x_mm"] == pytest.approx(160, abs=plan["step_x_mm"])
-        assert {warning["topic"] for warning in plan["warnings"]} & {"gap"}
+        # The width of the scene's grid, (41 - 1) steps of 4 mm, to within a step.
+        width_mm = (plan["columns"] - 1) * plan["step_x_mm"]
+        assert width_mm == pytest.approx((41 - 1) * 4.0, abs=plan["step_x_mm"])
+        assert "gap" in [warning["topic"] for warning in plan["warnings"]]
 
 
 def test_a_text_of_the_scene_stays_a_text_in_the_lines_of_the_rig_file():

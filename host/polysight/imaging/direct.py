@@ -83,13 +83,13 @@ def backproject(
     xp = scene.xp
     s = xp.asarray(samples, dtype=xp.complex128)
     image = xp.zeros(scene.voxels.shape[0], dtype=xp.complex128, device=scene.device)
-    # `turn` is exp(-2j pi x).
+    # `part` is a slice of positions, `delay` [position, voxel]. `turn` returns exp(-2j pi x) of its argument.
     for part, delay in scene.delays():
         if scene.step is None:
             for k, f in enumerate(scene.frequencies):
                 image += xp.sum(s[part, k : k + 1] * turn(xp, delay * f, xp.float64, xp.complex128), axis=0)
             continue
-        # Horner's rule: from one frequency to the next every phase grows by that of the spacing.
+        # Horner's rule: sum over k of s_k q^k = s_0 + q (s_1 + q (s_2 + ...)), q = exp(-2j pi delay step).
         phase_step = turn(xp, delay * scene.step, xp.float64, xp.complex128)
         total = s[part, -1:] * xp.ones_like(phase_step)
         for k in range(len(scene.frequencies) - 2, -1, -1):
@@ -117,7 +117,7 @@ def project(reflectivity: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels
 
 
 class _Scene:
-    """Checked geometry of a direct sum, as arrays of the library of `like` (default: `samples`); delays by chunks."""
+    """Geometry of a direct sum, with its shapes checked, as arrays of the library of `like` (default: `samples`)."""
 
     def __init__(
         self, samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any, like: Any = None
@@ -193,8 +193,8 @@ class DirectImager:
         xp = find_array_namespace(image)
         rx, m, rows, columns = self.aperture.shape
         pixels = xp.reshape(image, (-1,))
-        answers = [xp.permute_dims(project(pixels, *self._list_geometry(r)), (1, 0)) for r in range(rx)]
-        return xp.reshape(xp.stack(answers), (rx, m, rows, columns))
+        echoes = [xp.permute_dims(project(pixels, *self._list_geometry(r)), (1, 0)) for r in range(rx)]
+        return xp.reshape(xp.stack(echoes), (rx, m, rows, columns))
 
     def _list_geometry(self, rx: int) -> tuple[Any, ...]:
         """Return the arguments of `backproject` after the samples."""

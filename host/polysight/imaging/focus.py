@@ -3,11 +3,11 @@
 The scene is imaged on a stack of planes parallel to the stage. Any plane, also a tilted one, is a cut through this
 volume, so one stack is enough for the whole search.
 
-Sharpness is `sum I^2 / (sum I)^2` of the intensities I (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), counted per
-resolution cell instead of per pixel: cells grow with the distance of the plane, so that otherwise the nearest plane
-would be the sharpest. Points and edges determine the focus, the inside of a plate does not. A wrong depth causes a
-phase error that grows with the square of the aperture's length: a wide scan resolves a tenth of a millimetre, a narrow
-one does not.
+Sharpness is `sum w I^2 / (sum w I)^2` of the intensities I of the pixels (Fienup and Miller, J. Opt. Soc. Am. A 20,
+2003). The weight w is 1 over the area of a resolution cell: cells grow with the distance of the plane, so that with
+equal weights the nearest plane would be the sharpest. Points and edges determine the focus, the inside of a plate does
+not. A wrong depth causes a phase error that grows with the square of the aperture's length: a wide scan resolves a
+tenth of a millimetre, a narrow one does not.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from polysight.imaging.images import ImageBuilder
 from polysight.imaging.resolution import compute_limit_m
 
-# Largest tilt of the plane along x and along y that `focus_sweep` searches; a result near this limit is not certain;
-# chosen.
+# Largest tilt of the plane along x and along y that `focus_sweep` searches; chosen. A result near this limit is not
+# certain.
 _MAX_TILT_DEG = 3.0
 
 
@@ -85,7 +85,7 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
     Parameters
     ----------
     builder
-        Has all rows, and a range gate for at least this `depth_m`.
+        Builder with all rows, and with a range gate for at least this `depth_m`.
     depth_m
         Search range to either side of the rig file's plane.
     planes
@@ -147,20 +147,21 @@ def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> N
 def _interpolate_stack(
     stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values [ny, nx] of a stack [plane, ny, nx] at the depths z [ny, nx], metres, one for each pixel.
+    """Return the values [ny, nx] of a stack [plane, ny, nx] at the depth z [ny, nx] of each pixel, metres.
 
-    Interpolated along the depth by cubic convolution (Keys 1981).
+    They are interpolated along the depth by cubic convolution (Keys 1981).
     """
     place = (z - depths[0]) / (depths[1] - depths[0])
     base = np.clip(np.floor(place).astype(np.intp), 0, len(depths) - 2)
     t = place - base
+    # Weights of the planes base - 1, base, base + 1 and base + 2.
     weights = (
         ((-0.5 * t + 1.0) * t - 0.5) * t,
         (1.5 * t - 2.5) * t * t + 1.0,
         ((-1.5 * t + 2.0) * t + 0.5) * t,
         (0.5 * t - 0.5) * t * t,
     )
-    # The convolution needs one extrapolated plane beyond each end (Keys 1981).
+    # The convolution needs one extrapolated plane before the first and one after the last (Keys 1981).
     ends = [3 * stack[:1] - 3 * stack[1:2] + stack[2:3], 3 * stack[-1:] - 3 * stack[-2:-1] + stack[-3:-2]]
     stack = np.concatenate([ends[0], stack, ends[1]])
     rows, columns = np.indices(z.shape)

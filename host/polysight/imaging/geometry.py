@@ -1,11 +1,11 @@
 """Geometry of an aperture: positions of pixels, antennas and stage, and the `Aperture` that imagers take.
 
-`StageWindow` corrects the slope of a plate for the ends of the scan: if the scan ends within one Fresnel zone of the
-plate, more positions see the plate from one side than from the other, and the phase of its image rises although the
-plate is level, as if it were tilted by up to 0.8 degrees on a narrow scan.
+`StageWindow` corrects the estimated tilt of a plate for the ends of the scan: if the scan ends within one Fresnel zone
+of the plate, more positions see the plate from one side than from the other. The phase of its image then rises as if a
+level plate were tilted, by up to 0.8 degrees on a narrow scan.
 
-With it: checks of regularity, windows, the motion of the stage in a burst, and functions of the array API (namespace,
-transforms, device), so that imagers run on NumPy, PyTorch and CuPy.
+The module also has checks of regularity, windows, the motion of the stage in a burst, and functions of the array API
+(namespace, transforms, device), so that imagers run on NumPy, PyTorch and CuPy.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from polysight_shared.raster import RasterPlan, Row, mean_burst_travel_mm, plan_
 
 ROUNDS = 2
 END_STEP = 0.7
-"""`ROUNDS` of the iteration that finds slope and ends of a plate, and the share of the ends' error corrected in each
-(`END_STEP`). With more of either, it diverges for plates that lie half outside the illuminated part (78 drawn plates,
+"""The iteration that finds slope and ends of a plate has `ROUNDS` rounds; each corrects the share `END_STEP` of the
+ends' error. With more of either, it diverges for plates that lie half outside the illuminated part (78 drawn plates,
 apertures of 25 to 45 columns)."""
 
 SAME_END_PX = 5.0
-"""Distance up to which a plate's end by |H| and by its segmentation are the same one: about a resolution cell."""
+"""Distance up to which a plate's end by |H| and by its segmentation count as equal: about a resolution cell."""
 # Tolerance of positions: at a wavelength of 4 mm a path longer by this has 2e-3 rad more phase, far below the noise.
 _SAME_M = 1e-6
 # The lattice in y (of rows and pixels, `pitch_y_m`) may be finer than the pixels by this factor at most (chosen).
 _MAX_REFINEMENT = 4
-# Taps of the filter against the motion in a burst: positions to either side (chosen).
+# Largest number of taps to either side in the filter against the motion in a burst (chosen).
 REACH = 4
 # Largest frequency of the filter, cycles per position; chosen, 0.5 is the limit of the sampling.
 _FILTER_BAND = 0.45
@@ -170,8 +170,8 @@ def find_scene_gate_m(
     antennas: tuple[Antennas, ...], plan: RasterPlan, grid: ImageGrid, depth_m: float = 0.0
 ) -> tuple[float, float]:
     """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
-    # 2 mm of room (chosen) for the travel of the stage within a burst. The largest excess path is at a corner; the
-    # smallest is flat at its place, so that 41 points per axis (chosen) find it closely.
+    # Margin of 2 mm (chosen) for the travel of the stage within a burst. The largest excess path is at a corner. Near
+    # the smallest one the excess path changes little, so that 41 points per axis (chosen) find it closely.
     half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3
     half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
     dx, dy = np.meshgrid(
@@ -250,7 +250,7 @@ def fit_row_starts_m(offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def pitch_y_m(aperture: Aperture) -> float | None:
-    """Return the largest common divisor of row spacing and pixel of at least a quarter pixel, metres; None without."""
+    """Return the largest common divisor of row spacing and pixel, metres; None if it is below a quarter pixel."""
     y = aperture.offsets_m[:, 0, 1]
     for finer in range(1, _MAX_REFINEMENT + 1):
         pitch = aperture.grid.pixel_m / finer
@@ -261,9 +261,11 @@ def pitch_y_m(aperture: Aperture) -> float | None:
 
 
 def design_burst_filters(rig: Instrument) -> NDArray[np.float32]:
-    """Return inverse filters of the motion in a burst with 0, 1, .. `REACH` taps per side, float32 [reach, REACH + 1].
+    """Return inverse filters of the motion in a burst, float32 [reach, REACH + 1], for each reach from 0 to `REACH`.
 
-    The first tap is the middle one, the others apply on both sides. Least squares up to 0.45 cycles per position.
+    `reach` is the number of taps to either side. The first tap is the middle one, each further one applies on both
+    sides. The motion multiplies the spectrum by the mean of cos(2 pi f shift) over the chirps of a burst; the filters
+    are least squares fits to the inverse of this loss, for f up to 0.45 cycles per position.
     """
     times_s = np.array(rig.burst.chirp_times_s)
     # Motion of the stage from the middle of the burst to each chirp, in positions.
@@ -291,13 +293,15 @@ def undo_burst_motion(
     samples
         complex64 [..., position].
     valid
-        bool [position]: the filter uses as many neighbours as are valid on both sides; none at the row's ends.
+        bool [position]. At each position the filter reaches as far as all neighbours are valid on both sides; not at
+        all at the row's ends.
     turn
         float64 [position]: centre of the filter's band, radians per position.
     filters
         Filters that :func:`design_burst_filters` returned.
     """
     count = valid.size
+    # Reach of the filter at each position: it grows by one while both neighbours at the next distance are valid.
     reach = np.zeros(valid.size, int)
     for i in range(1, min(REACH, (count - 1) // 2) + 1):
         has_valid_neighbours = np.zeros(count, bool)
@@ -314,7 +318,7 @@ def undo_burst_motion(
 
 def make_window(name: Window, n: int) -> NDArray[np.float64]:
     """Return a symmetric window, float64 [n]: one of n + 2 points without its end points (zero for some windows)."""
-    # Common ones in NumPy: scipy.signal loads scipy.stats, which takes a second.
+    # Common windows are made with NumPy: scipy.signal loads scipy.stats, which takes a second.
     match name:
         case "boxcar":
             weights = np.ones(n + 2)
@@ -354,8 +358,8 @@ def find_array_namespace(array: Any) -> Any:
 def transform_in_place(xp: Any, array: Any, axis: int, inverse: bool = False) -> Any:
     """Return the Fourier transform of complex64 along an axis; it may be in the memory of `array`.
 
-    SciPy's, for NumPy, keep single precision. In new memory they may take three times as long (published grid): the
-    system clears its pages, unless the allocator has kept them.
+    SciPy's transforms are used for NumPy arrays, because they keep single precision. A result in new memory may take
+    three times as long (published grid): the system clears new pages first.
     """
     transforms = scipy.fft if xp is np else xp.fft
     transform = transforms.ifft if inverse else transforms.fft
@@ -371,11 +375,17 @@ def get_device(array: Any) -> Any:
 
 @dataclass(frozen=True)
 class StageWindow:
-    """The scan along one axis: specular points of the stage's positions, and their weights.
+    """The scan along one axis (x or y): the specular point of each position on the object plane, and its weight.
 
-    `places_px` [position] are in pixels from the first pixel, `weights` [position] those of the window over the
-    aperture. `bend_px` is the growth of the phase by the square of the distance from the specular point, radians per
-    pixel^2.
+    Attributes
+    ----------
+    places_px
+        [position]: specular points, in pixels from the first pixel.
+    weights
+        [position]: window over the aperture.
+    bend_px
+        b, radians per pixel^2: an echo from a point at the distance d from the specular point has the phase b d^2 more
+        than one from the specular point.
     """
 
     places_px: NDArray[np.float64]
@@ -383,15 +393,19 @@ class StageWindow:
     bend_px: float
 
     def level_image(self, ends_px: NDArray[np.float64], columns_px: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the image of a level plate between `ends_px` [2] over that of a mirror, [column].
+        """Return the image of a level plate over that of an endless mirror, at the pixels `columns_px`, [column].
 
-        Unless the plate is in the middle of the scan, the part of its spectrum that the scan sees is not symmetric, so
-        that its phase rises (Fresnel integrals over the plate).
+        The plate lies between `ends_px` [2].
+        Unless the plate is in the middle of the scan, the scan sees more of its spectrum on one side, so that the phase
+        of its image rises. The echo at each position is a Fresnel integral over the plate; the image sums the echoes
+        with weight times exp(-j b d^2).
         """
+        # Ends of the plate as arguments of the Fresnel integrals, [2, position].
         distance_from_specular = (ends_px[:, None] - self.places_px) * np.sqrt(2 * self.bend_px / np.pi)
         sine, cosine = scipy.special.fresnel(distance_from_specular)
-        # Echo of the plate at each position; that of an endless mirror is 1 + j.
+        # Echo of the plate at each position [position]; that of an endless mirror is 1 + j.
         echo = (cosine[1] - cosine[0]) + 1j * (sine[1] - sine[0])
+        # [column, position]
         distance = columns_px[:, None] - self.places_px
         kernel = self.weights * np.exp(-1j * self.bend_px * distance**2)
         return np.asarray(kernel @ echo / kernel.sum(axis=1) / (1 + 1j), np.complex128)
@@ -407,44 +421,48 @@ class StageWindow:
         mask_ends_px: NDArray[np.float64],
         moved_px: float,
     ) -> float:
-        """Return the rise of a plate, radians, without the rise that a level plate at its place seems to have.
+        """Return the rise of a plate, radians, without the apparent rise of a level plate at the same place.
+
+        The apparent rise follows from `level_image`, which needs the plate's ends. Where |H| falls to half shows them,
+        but the scan shifts this place, too. So slope and ends are improved in turn, in `ROUNDS` rounds.
 
         Parameters
         ----------
         slope
-            Rise by the phase step between pixels alone, radians.
+            Rise that follows from the phase step between pixels alone, radians.
         inside_px
             Pixels along this axis inside the plate, ascending.
         slope_per_rad
             Rise for a phase step of one radian.
         profile, lit
-            |H| along this axis, mean over the plate's lines, [pixel], and where the scan illuminates it enough (at
-            least at one pixel).
+            |H| along this axis, mean over the plate's lines, [pixel]; True where the scan illuminates it enough (for at
+            least one pixel).
         mask_ends_px
-            Where the plate ends along this axis by its segmentation, [2].
+            Ends of the plate along this axis by its segmentation, [2].
         moved_px
-            How far from its pixel a plate that rises by one is seen, pixels.
+            A plate with the rise 1 is seen this many pixels away from its place.
         """
         step_rad = slope / slope_per_rad
         columns_px = np.arange(profile.size, dtype=np.float64)
         seen_px = find_ends(profile, lit, inside_px)
-        # Between plates that touch, |H| does not fall to half, or does so elsewhere: there the end is that of the
-        # segmentation. A plate that is segmented up to the end of the illuminated part continues: it has no end.
+        # Between plates that touch, |H| does not fall to half at the end, or does so elsewhere: there the end of the
+        # segmentation is taken. A plate that is segmented up to the end of the illuminated part may continue beyond it:
+        # its end is taken at infinity.
         touching = np.abs(seen_px - mask_ends_px) > SAME_END_PX
         light_ends_px = np.flatnonzero(lit)[[0, -1]]
         is_end_in_light = np.abs(light_ends_px - mask_ends_px) > SAME_END_PX
         ends_px = np.where(touching, np.where(is_end_in_light, mask_ends_px, [-np.inf, np.inf]), seen_px)
         for _ in range(ROUNDS):
-            # A rising plate reflects towards the antennas at other stage positions than a level one: as a level one
-            # that lies `level_offset_px` further along. There its image is computed.
+            # A rising plate reflects towards the antennas at other stage positions than a level one at its place: at
+            # those of a level plate `level_offset_px` away. The image is computed there.
             level_offset_px = moved_px * slope
             image = self.level_image(ends_px + level_offset_px, columns_px + level_offset_px)
-            # Its angle is the mean phase step between pixels that the level plate seems to have.
+            # Its angle is the mean phase step of the level plate between pixels.
             product = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
             slope = slope_per_rad * (step_rad - float(np.angle(product)))
             seen_of_level = find_ends(np.abs(image), lit, inside_px)
-            # Ends that both the plate and the level one have within the light. How far from its place an end is seen is
-            # the same for both.
+            # Correct the ends that are illuminated, of the plate and of the level one. The distance between an end and
+            # the place where |H| falls to half is taken as the same for both plates.
             is_seen = ~touching & np.isfinite(seen_of_level) & np.isfinite(ends_px)
             off_px = seen_of_level[is_seen] - ends_px[is_seen]
             ends_px[is_seen] = seen_px[is_seen] - END_STEP * off_px
@@ -452,9 +470,10 @@ class StageWindow:
 
 
 def find_ends(profile: NDArray[np.float64], lit: NDArray[np.bool_], inside_px: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return where a plate's |H| falls to half of its median inside, [2] pixels.
+    """Return the two places where a plate's |H| falls to half of its median inside, [2], pixels.
 
-    -inf or inf if it does not within `lit`, or is below half at the outermost pixel inside already.
+    A place is -inf or inf if |H| does not fall to half within `lit`, or if it is already below half at the outermost
+    pixel inside.
     """
     half = float(np.median(profile[inside_px])) / 2
     ends = []

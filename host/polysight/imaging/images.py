@@ -5,21 +5,21 @@ parts of the sweep that overlap by half. `Images` is what every later step reads
 polarimetry adds metal reference and ratio.
 
 Tilt. A level plate is seen at a pixel from the stage position whose specular point on the object plane is that pixel. A
-plate with the rise s (dz/dx, dz/dy) is seen there from another position: the one whose specular point is away by
+plate with the rise s (dz/dx, dz/dy) is seen there from another position, whose specular point is away from it by
 
     d = H^-1 C s        H = second derivatives of r1 + r2 by x and y [2, 2],   C = (e1 + e2)_z
 
 with r1, r2 the lengths of TX's and RX's legs (metres) and e1, e2 their unit vectors: specular reflection requires
-(e1 + e2)_xy + s (e1 + e2)_z = 0, and (e1 + e2)_xy grows with H from the specular point. There the aperture has another
-weight, which differs between H and V, as their specular points differ: 2.5 % of V / H per degree on the published rig
-(simulated). So a pixel of a tilted plate is divided by the mirror's footprint `d` away (`Illumination.to_level`). The
-rise follows from the image, whose phase grows by k C s, radians per metre, k the wave number (`Illumination.rise`).
+(e1 + e2)_xy + s (e1 + e2)_z = 0, and (e1 + e2)_xy grows with H from the specular point. At that position the aperture
+has another weight. It differs between H and V, as their specular points differ: 2.5 % of V / H per degree on the
+published rig (simulated). So a pixel of a tilted plate is divided by the mirror's footprint at the distance d, not by
+that at the pixel (`Illumination.to_level`). The rise follows from the image, whose phase grows by k C s, radians per
+metre, k the wave number (`Illumination.estimate_rise`).
 
-`ImagedWith` has the settings that the gains of an image depend on; a metal reference is used only for images with the
-same settings. Samples are referenced to the direct path, and images are divided by the footprint of an ideal mirror.
-The remaining gains in the image of a metal plate come from antenna patterns, position errors and edges. They depend on
-position and orientation of the antennas, object plane, frequencies, window over the aperture, and assumed high-pass
-filters. They do not depend on settings that cancel:
+`ImagedWith` has the settings on which the gains of an image depend; a metal reference is used only for images with the
+same settings. Samples are divided by the direct path, and images by the footprint of an ideal mirror. The remaining
+gains come from antenna patterns, position errors and edges. They depend on position and orientation of the antennas,
+object plane, frequencies, window over the aperture, and assumed high-pass filters, but not on settings that cancel:
 
 * receiver and transmitter gain, start frequencies, triggers, crystals, power cycles: equal for direct path and echo;
 * raster, masked positions, pulses of a burst: contained in the footprint;
@@ -58,13 +58,13 @@ MAX_RISE = 0.06
 MIN_RISE = 2e-3
 """Smallest rise that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours; chosen."""
 _FEEBLE_RATIO = 0.12
-"""|V| over |H| of a patch below which V's phase is not used: permittivities below 2.8 at 55 degrees."""
+"""V's phase is not used in patches with |V| / |H| below this: permittivities below 2.8 at 55 degrees."""
 _LEAST_LINES = 6
-"""Columns or rows of pixels in a patch from which a curvature is estimated; chosen."""
+"""Least number of columns or rows of pixels in a patch for an estimate of its curvature; chosen."""
 _LEAST_COHERENCE = 0.5
 """Smallest coherence of the phase steps between pixels (1: all equal); chosen."""
 _MAX_CHANGE = 2.0
-"""Largest factor of the footprint over the distance `d` that is used; chosen: larger ones occur at the edge alone."""
+"""Largest factor between two footprints that is used; chosen: larger ones occur only at the edge."""
 
 SAME_MM = 1e-3
 """Tolerance of positions, mm: 2e-3 rad of an echo's phase."""
@@ -73,7 +73,7 @@ SAME_HZ = 1e3
 SAME_CORNER_KHZ = 10.0
 """Tolerance of filter corners: less than 0.1 dB and 0.1 degrees between direct path and echo, in both channels."""
 ARM_MM = 100.0
-"""Distance of two points, along a board's x and y, that are compared to see its rotation; antennas are in one line."""
+"""Distance of two points along a board's x and y, whose places show its rotation; the antennas are in one line."""
 
 # Smallest footprint of a valid pixel, relative to the strongest; chosen: weaker pixels are mostly noise.
 _LEAST_FOOTPRINT = 0.15
@@ -94,7 +94,7 @@ class Illumination:
     footprints
         complex64 [2, ny, nx]: the image of a uniform mirror, H and V.
     moved_m
-        float64 [channel, (x, y) of `d`, rise along x or y]: H^-1 C, `d` in metres for a rise of 1.
+        float64 [channel, (x, y) of d, rise along x or y]: H^-1 C, d in metres for a rise of 1.
     steepness_rad_m
         float64 [2]: k C of each channel, growth of the phase for a rise of 1, radians per metre.
     pixel_m
@@ -129,9 +129,9 @@ class Illumination:
         """Estimate the rise of a patch along x and y from its phase; 0 along an axis where it is undetermined.
 
         `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
-        the patch. V is left out where it nearly vanishes (`_FEEBLE_RATIO`), for its phase is of neighbours' sidelobes.
-        `plate` [ny, nx] is the whole patch. With it, the rise that a level plate seems to have is subtracted
-        (`StageWindow` in :mod:`polysight.imaging.geometry`); None: it is not.
+        the patch. V is left out where it nearly vanishes (`_FEEBLE_RATIO`): its phase is that of neighbours' sidelobes.
+        `plate` [ny, nx] is the whole patch. With it, the apparent rise of a level plate is subtracted (`StageWindow` in
+        :mod:`polysight.imaging.geometry`).
         """
         if not mask.any():
             return 0.0, 0.0
@@ -180,7 +180,7 @@ class Illumination:
     def estimate_bend(self, h: Image, v: Image, mask: Mask) -> tuple[float, float]:
         """Estimate a patch's curvature along x and y from its phase, 1 / m, positive where it bends away; 0 if unknown.
 
-        The phase from pixel to pixel, summed over 3 or more lines, grows evenly on a surface of one curvature.
+        On a surface of one curvature the phase step between pixels grows linearly; it is averaged over 3 or more lines.
         """
         channel = h if np.nansum(np.abs(h[mask])) >= np.nansum(np.abs(v[mask])) else v
         bends = []
@@ -216,7 +216,7 @@ class Illumination:
         return np.stack([self._change(k, mask, self.moved_m[k][:, self.across] * slope) for k in (0, 1)])
 
     def _change(self, channel: int, mask: Mask, moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return |footprint| at a patch's pixels over that `moved_m` away, [n]; 1 where beyond `_MAX_CHANGE`."""
+        """Return |footprint| at a patch's n pixels over that `moved_m` away; 1 if the factor exceeds `_MAX_CHANGE`."""
         rows, columns = np.nonzero(mask)
         level = np.abs(self.footprints[channel])
         coordinates = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
@@ -230,7 +230,7 @@ class Dispersion:
     """Change of the reflectivity over the sweep: 0 for a half space; not for a thin plate, whose faces interfere.
 
     `h`, `v` complex [ny, nx]: change of ln h and of ln v from the first to the last frequency of `band_hz`, relative to
-    a mirror on the plane; NaN where nothing is seen. Each has a constant of its own until that of metal is subtracted.
+    a mirror on the plane; NaN where nothing is seen. Each includes a constant until the change of metal is subtracted.
     """
 
     h: Image
@@ -271,9 +271,9 @@ class Images:
     dispersion
         Change over the sweep; None where it was not formed.
     raised_m
-        float64 [ny, nx]: how far behind the images' plane each pixel was imaged (negative: nearer); None: nowhere.
+        float64 [ny, nx]: distance behind the images' plane at which a pixel was imaged (negative: nearer); None: 0.
     rx_gains
-        Board name to complex128 [rx]: gain of each RX, measured by the direct path. It was divided out. NaN: not used.
+        Board name to complex128 [rx]: gain by which each RX was divided, measured by the direct path. NaN: not used.
     notices
         Notices for the user, for example of slow imaging.
     """
@@ -326,7 +326,7 @@ class Images:
 
 
 def specular_point_m(antennas: Antennas, z_m: float) -> NDArray[np.float64]:
-    """Return the point of the plane at `z_m` that reflects TX into a board's RX: x, y [2], metres, stage at zero."""
+    """Return the point of a mirror at `z_m` that reflects TX into a board's RX: x, y [2], metres, stage at zero."""
     tx = antennas.tx_m
     rx = antennas.rx_m.mean(axis=0)
     z_tx = z_m - tx[2]
@@ -378,7 +378,7 @@ def _step(image: Image, mask: Mask, axis: int) -> complex:
 
 @dataclass(frozen=True)
 class View:
-    """Plane and pixels of an image: those of the rig file where None; the plane is `depth_mm` farther away."""
+    """Plane and pixels of an image: the plane is `depth_mm` behind the rig file's; None stands for the rig file's."""
 
     depth_mm: float = 0.0
     columns: int | None = None
@@ -432,7 +432,7 @@ class ImageBuilder:
         self.grid = image_grid(rig)
         self.live = live
         if live:
-            # Load it now instead of after the last row.
+            # Loaded now, so that the last row does not wait for it.
             import_module("scipy.ndimage")
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
@@ -493,7 +493,7 @@ class ImageBuilder:
         visible = np.ones(self.grid.shape, bool)
         for _, footprint, _ in (h, v):
             strong = np.abs(footprint) >= _LEAST_FOOTPRINT * np.abs(footprint).max()
-            # The rim of the footprint ripples with the row spacing; a majority filter avoids stripes.
+            # Near its edge the footprint ripples with the row spacing; a majority filter avoids stripes.
             share = scipy.ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
             visible &= (share > 0.5) & (footprint != 0)
         divided = [np.divide(raw, foot, out=np.zeros_like(raw), where=visible).conj() for raw, foot, _ in (h, v)]

@@ -7,10 +7,14 @@ A plate's echo gives its *height*, the distance behind the rig file's plane, in 
 Both ways compare the echo with that of a mirror on the rig file's plane, seen from the same positions. So aperture,
 taper (weights of the positions) and masked positions have no influence. The image of that mirror is the *footprint*.
 
-One plane is fitted to most plates. Plates whose height by range is another, blocks of other thickness, are *raised*:
-each is imaged on a plane of its own, because at another distance it is seen at another angle. Plates of several
-thicknesses lie near some tilted plane, too, but then the plates themselves are level: their own tilts, from the phase
-over each plate, are the prior of the plane's.
+One plane is fitted to most plates:
+
+    height(x, y) = height at the middle + rise_x x + rise_y y
+
+Plates at another height by range, such as blocks of another thickness, are *raised*: each is imaged on a plane of its
+own, because at another distance it is seen at another angle. Level plates of several thicknesses can also be near some
+tilted plane. The *own tilts* of the plates, from the phase over each plate, rule that out: they are the prior of the
+plane's tilt.
 """
 
 from __future__ import annotations
@@ -30,42 +34,40 @@ from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
 
 PLANE_REACH_M = 0.015
-"""Largest offset of the plates' plane from the rig file's to which images are moved, and for which echoes are kept;
-chosen.
-"""
+"""Images are moved to planes up to this far from the rig file's plane, and echoes from there are kept; chosen."""
 MOUNT_STD_M = 1e-3
-"""Standard deviation of the antennas' distance by errors of the rig file, added to that of a plane that was found;
-chosen."""
+"""Standard deviation of the antennas' distance by errors of the rig file, added to that of a known plane; chosen."""
 PRIOR_STD_M = 5.8e-3
 """Standard deviation of the plane's distance if the scene does not determine it: that of a uniform error within +-10 mm
 (chosen)."""
 _WORTH_M = 5e-4
 """Smallest offset of the plane for which images are formed again. A smaller one changes the incidence angle by less
-than an error of MOUNT_STD_M does."""
+than an error of MOUNT_STD_M."""
 _STEP_M = 2e-4
 """Step of height for the numerical derivatives of range and phase; chosen."""
 _LEAST_COHERENCE = 0.7
-"""Smallest coherence of a plate's pixels, |sum| / sum of magnitudes, if its phase is used (1: equal phases); chosen."""
+"""A plate's phase is used if the coherence of its pixels, |sum| / sum of magnitudes, is above this; chosen."""
 _TILT_PRIOR_RAD = 0.02
 """Prior standard deviation of the tilt along x and along y: about one degree (chosen)."""
 _OWN_TILT_STD = 5e-3
-"""Standard deviation of the plane's tilt if all plates have one tilt of their own, rise per metre: 0.3 degrees
-(chosen). A phase that grows over the scan, as by an error of the stage's scale, seems to tilt all plates alike."""
+"""Smallest standard deviation of the tilt by the plates' own tilts, rise per metre: 0.3 degrees (chosen). A phase that
+grows over the scan, as by an error of the stage's scale, looks like an equal tilt of all plates."""
 _LEAST_OWN_TILTS = 3
-"""Least number of plates whose own tilts say something about the plane's; chosen: their scatter is needed."""
+"""Least number of own tilts that are used; chosen: their scatter is needed."""
 _MIN_STD_M = 3e-4
 """Smallest standard deviation of a height by range, due to sidelobes of the plate's neighbours; chosen."""
 _MAX_RISE_BY_PHASE = 0.035
-"""Largest tilt of a plane by phase that is accepted, rise per metre: two degrees; chosen."""
+"""Largest accepted tilt of a plane by phase, rise per metre: two degrees; chosen."""
 _TILT_TOLERANCE = 3e-3
 """Accepted difference between the tilts by phase and by range, in addition to three standard deviations of the latter,
 rise per metre (chosen)."""
 _MAX_RANGE_STD_M = 0.05
 """Largest standard deviation of a height by range that is used (chosen)."""
-# Footprint over its largest value above which a pixel is lit; pixels around a plate's inside that may still show it;
-# and share of a square beside the plates that has to be free of them. All chosen.
+# Pixels with a larger footprint, relative to the largest one, are illuminated; chosen.
 _LIT_FOOTPRINT = 0.1
+# Distance from a plate's inside up to which a pixel may still show the plate; chosen.
 _AROUND_PX = 5
+# Squares of the background are used if more than this share of their pixels shows no plate; chosen.
 _MOST_OF_SQUARE = 0.6
 _PHASE_FITS_RAD = 0.5
 """Largest root mean square of the phases' deviations from the fitted plane, radians (chosen); random phases have
@@ -74,22 +76,22 @@ _PHASE_STD_M = 5e-5
 """Standard deviation of a height by phase, due to roughness and to the phase of the reflection (some degrees for lossy
 plates); chosen."""
 RAISED_M = 1.5e-3
-"""Least distance of a plate by range from the plane of the others for a plane of its own, and at least three standard
-deviations. It turns the angle by 1.5 mrad, as much as the error of the angle. Thin plates seem to lie up to a
-millimetre deeper, because their rear face echoes, too. Chosen."""
+"""A plate is raised if its height by range differs from the plane of the others by more than this, and by more than
+three standard deviations. Such a difference changes the incidence angle by 1.5 mrad, as much as the error of the angle.
+Thin plates appear up to a millimetre deeper, because their rear face echoes, too. Chosen."""
 _PRECISE_STD_M = 2e-3
-"""Largest standard deviation of a height by range that can show that a plate is raised; chosen. In the demo's scene a
-table shines through: heights of its plates have 4 to 13 mm, but for copper."""
+"""Only plates whose height by range has a smaller standard deviation can be raised; chosen. In the demo's scene the
+echo of a table passes through the plates: their heights have 4 to 13 mm, except for copper."""
 _BOARDS_AGREE_M = 3e-3
-"""Largest difference of a raised plate's heights by range in H and in V, plus three standard deviations; chosen. A
+"""The heights by range of a raised plate in H and in V differ by at most this and three standard deviations; chosen. A
 liquid behind glass changes over the sweep, differently in H and V: its two heights are 35 mm apart."""
 _LEVEL_STD_M = 5e-4
 """Standard deviation of the heights of plates of one plane, in addition to that by range; chosen."""
 _LEVEL_STDS = 3.0
-"""Distance from the plane, in standard deviations, beyond which a plate does not count for the plane; chosen."""
+"""A plate farther from the plane than this, in standard deviations, is left out of the plane's fit; chosen."""
 _RAISED_REACH_M = 0.012
-"""A raised plate's own plane replaces the images up to this far around its inside, but no nearer to another plate:
-over its edges, which `find_interiors` has left out; chosen."""
+"""A raised plate's own plane replaces the images at pixels up to this far from its inside that are not nearer to
+another plate. So they include its edges, which `find_interiors` has left out. Chosen."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +119,10 @@ class TiltPrior:
     def from_plates(cls, rises: Sequence[Rise]) -> TiltPrior:
         """Return the prior, given the plates' own rises along x and y, radians; a rise of 0 counts as unknown.
 
-        The tilt has a prior around 0 (`_TILT_PRIOR_RAD`). Plates on a tilted plane are tilted with it: the median of
-        theirs is a measurement of it, as precise as their scatter (1.25 standard deviations over the root of their
-        number: the error of a median) and `_OWN_TILT_STD` say.
+        Along each axis two normal distributions of the tilt are multiplied. One is around 0, with the standard
+        deviation `_TILT_PRIOR_RAD`. The other is around the median of the plates' own tilts, because plates on a tilted
+        plane are tilted with it. Its variance is that of a median, (1.25 std / sqrt(number of plates))^2, plus
+        `_OWN_TILT_STD`^2.
         """
         mean = np.zeros(2)
         std = np.full(2, _TILT_PRIOR_RAD)
@@ -150,7 +153,8 @@ class PlaneEstimate:
     heights_m
         float64 [patch]: height of each patch, by range, or by phase if `by_phase` and not raised; NaN if undetermined.
     by_phase
-        True if the phases of plates that are not raised fit one plane that agrees with the ranges: it is the estimate.
+        True if the plane is that of the phases: those of the plates that are not raised fit one plane, which agrees
+        with the ranges.
     plates
         Number of patches with a height by range; 0 if the plane is not known.
     raised
@@ -207,8 +211,8 @@ class PlaneEstimate:
     def incidence_std_rad(self, rig: Instrument) -> float:
         """Return the standard deviation of the incidence angle theta, radians.
 
-        It is that of the plane's distance z (with the antennas' positions if the plane is known) times
-        d theta / d z = sin theta cos theta / z.
+        It is d theta / d z = sin theta cos theta / z times the standard deviation of the plane's distance z. If the
+        plane is known, that of the antennas' distance is added (as squares).
         """
         theta = np.radians(incidence_deg(rig, rig.receivers[0]))
         offset_std_m = PRIOR_STD_M
@@ -255,7 +259,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises:
     Parameters
     ----------
     builder
-        Has the rows, and a range gate that includes the plane (`depth_m`).
+        Builder with the rows, and with a range gate that includes the plane (`depth_m`).
     masks
         bool [ny, nx], one per patch, on the builder's grid.
     rises
@@ -265,6 +269,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises:
     tilt = TiltPrior.from_plates(rises)
     x = grid.x_m - grid.x_m.mean()
     y = grid.y_m - grid.y_m.mean()
+    # Heights and standard deviations [patch] of each board.
     ranges = [_estimate_heights_by_range(board, masks) for board in builder.boards.values()]
     precision = np.stack([1 / std**2 for _, std in ranges])
     total = precision.sum(axis=0)
@@ -284,8 +289,8 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises:
     is_level = determined.copy()
     if is_precise.any():
         level_stds = np.hypot(stds[is_precise], _LEVEL_STD_M)
-        off_most = heights[is_precise] - _fit_most(places[is_precise], heights[is_precise], level_stds, tilt)
-        is_level[is_precise] = np.abs(off_most) <= _LEVEL_STDS * level_stds
+        heights_of_most = _fit_most(places[is_precise], heights[is_precise], level_stds, tilt)
+        is_level[is_precise] = np.abs(heights[is_precise] - heights_of_most) <= _LEVEL_STDS * level_stds
     plane, covariance = _fit_plane(places[is_level], heights[is_level], np.hypot(stds[is_level], _MIN_STD_M), tilt)
     is_by_phase = False
     phase_fit = _fit_plane_by_phase(builder, masks, places, is_level, (plane, covariance, tilt))
@@ -293,10 +298,10 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises:
         is_by_phase = True
         plane, covariance, phase_heights = phase_fit
         heights = np.where(is_level & np.isfinite(phase_heights), phase_heights, heights)
-    apart_m = np.abs(heights - _evaluate_plane(plane, places))
-    apart_of_boards_m = np.ptp([of_board for of_board, _ in ranges], axis=0)
-    boards_agree = apart_of_boards_m <= _BOARDS_AGREE_M + 3 * np.linalg.norm([std for _, std in ranges], axis=0)
-    is_raised = is_precise & ~is_level & (apart_m > np.maximum(RAISED_M, 3 * stds)) & boards_agree
+    distance_m = np.abs(heights - _evaluate_plane(plane, places))
+    difference_of_boards_m = np.ptp([heights_of_board for heights_of_board, _ in ranges], axis=0)
+    boards_agree = difference_of_boards_m <= _BOARDS_AGREE_M + 3 * np.linalg.norm([std for _, std in ranges], axis=0)
+    is_raised = is_precise & ~is_level & (distance_m > np.maximum(RAISED_M, 3 * stds)) & boards_agree
     std = np.sqrt(np.diag(covariance))
     return PlaneEstimate(
         offset_m=float(plane[0]),
@@ -313,7 +318,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises:
 def _mark_raised(
     masks: Sequence[NDArray[np.bool_]], heights: NDArray[np.float64], is_raised: NDArray[np.bool_], pixel_m: float
 ) -> tuple[RaisedPlate, ...]:
-    """Return the raised plates with their regions: pixels that are nearest to their insides, and not too far."""
+    """Return the raised plates with their regions (`_RAISED_REACH_M`)."""
     if not is_raised.any():
         return ()
     numbers = np.zeros(masks[0].shape, np.intp)
@@ -383,8 +388,10 @@ def _estimate_heights_by_range(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the height by range of each patch, and its standard deviation, metres, [patch].
 
-    Where the range does not determine the height, it is NaN and its standard deviation infinite. What shines through
-    from behind, such as a table, shifts all pixels of a plate alike: its size is that beside the plates.
+    The height is the relative change of the amplitude with range, minus that of a mirror, over the change of a mirror's
+    per metre of height. Where the range does not determine the height, it is NaN and its standard deviation infinite.
+    The echo of what lies behind a plate, such as a table, passes through it and changes all of its pixels equally. This
+    error is not in the scatter of the pixels: it is taken from the background next to the plates.
     """
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
@@ -392,25 +399,25 @@ def _estimate_heights_by_range(
     moved_slope = board.mirror_slope(_STEP_M)
     heights = np.full(len(masks), np.nan)
     stds = np.full(len(masks), np.inf)
-    slope_from_behind = _measure_slope_behind(image, footprint, slope, mirror_slope, masks)
+    slope_behind = _measure_slope_behind(image, footprint, slope, mirror_slope, masks)
     for i, mask in enumerate(masks):
         power = np.abs(image[mask].astype(np.complex128)) ** 2
         if not power.sum() > 0:
             continue
         weight = power / power.sum()
-        # Relative change of the amplitude with range minus that of a mirror; and the same of a mirror per metre of its
-        # height.
+        # [pixel]: relative change of the amplitude with range, minus that of a mirror on the rig file's plane; the same
+        # for a mirror at the height _STEP_M, per metre of height.
         with np.errstate(invalid="ignore", divide="ignore"):
             path_slope = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
-            heights_of_slopes = (
+            slope_per_height = (
                 np.real(moved_slope[mask] / moved_image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
             ) / _STEP_M
-        per_metre = float(np.nansum(weight * heights_of_slopes))
+        per_metre = float(np.nansum(weight * slope_per_height))
         path_slope = np.where(np.isfinite(path_slope), path_slope, 0.0)
         mean = float(np.sum(weight * path_slope))
         path_std = float(np.sqrt(np.sum(weight * (path_slope - mean) ** 2)))
         height = mean / per_metre
-        std = float(np.hypot(path_std, slope_from_behind / np.sqrt(power.mean()))) / abs(per_metre)
+        std = float(np.hypot(path_std, slope_behind / np.sqrt(power.mean()))) / abs(per_metre)
         if std < _MAX_RANGE_STD_M:
             heights[i] = height
             stds[i] = max(std, _MIN_STD_M)
@@ -424,11 +431,11 @@ def _measure_slope_behind(
     mirror_slope: NDArray[np.complexfloating],
     masks: Sequence[NDArray[np.bool_]],
 ) -> float:
-    """Return how much the change of the amplitude with range of a plate is wrong by what lies beside and behind it.
+    """Return the standard deviation by the background of the change of a plate's amplitude with range.
 
-    It is the root mean square of one part, over squares of a plate's size away from all plates, of the image's slope
-    minus that of an echo as strong on the plane; 0 without such squares. Over a plate's |image| it is the error of the
-    relative slope.
+    In the background, away from all plates, the image's slope minus that of an equally strong echo on the plane is
+    averaged over squares of a plate's size. The result is the root mean square of the real part, and of the imaginary
+    part, of these means; 0 without such squares. Divided by a plate's |image| it is the error of its relative slope.
     """
     lit = np.abs(footprint) > _LIT_FOOTPRINT * np.abs(footprint).max()
     plates = np.logical_or.reduce([*masks, np.zeros(image.shape, bool)])
@@ -456,11 +463,12 @@ def _estimate_heights_by_phase(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the heights by phase [patch], metres, NaN where pixels are not coherent; and the radians per metre.
 
-    Only patches of `chosen` [patch] get a height.
+    Only patches of `chosen` [patch] get a height. `places` [patch, 2] are the middles of the patches, metres. `board`
+    is the one of H.
 
-    The multiple of the ambiguity of each height is the one with which all heights fit a plane best, `near` a plane [3]
-    (height and rise along x and y, by range) and with the prior of its tilt. `places` [patch, 2] are the middles of the
-    patches, metres. `board` is the one of H.
+    A phase gives a height but for a multiple of the ambiguity. The multiples are chosen so that all heights fit one
+    plane best: many trial planes are taken around the plane by range (`near`: the plane [3], height and rise along x
+    and y, and the prior of its tilt); for each, every height is moved to the multiple next to it.
     """
     plane, prior = near
     image, footprint, _ = board.image()
@@ -468,7 +476,7 @@ def _estimate_heights_by_phase(
     phases = np.full(len(masks), np.nan)
     rates = []
     for i, mask in enumerate(masks):
-        # The reflection r_s of a plate is nearly real and negative: the minus turns its phase to about zero.
+        # The reflection r_s of a plate is nearly real and negative: with the minus its phase is about zero.
         relative_to_mirror = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
         coherence = abs(relative_to_mirror.sum()) / max(float(np.abs(relative_to_mirror).sum()), 1e-300)
         if chosen[i] and mask.any() and coherence > _LEAST_COHERENCE:
@@ -481,18 +489,21 @@ def _estimate_heights_by_phase(
     ambiguity_m = 2 * np.pi / abs(rad_per_m)
     plates_with_phase = np.flatnonzero(np.isfinite(phases))
     design = np.column_stack([np.ones(plates_with_phase.size), places[plates_with_phase]])
-    # Ranges leave an ambiguity of some turns. It is common to all plates if the tilt is right: 17 tilts along each axis
-    # are tried, within one standard deviation of the prior.
+    # The plane by range may be wrong by some multiples of the ambiguity. If the tilt is right, the error is common to
+    # all plates. 17 tilts along each axis are tried, within one standard deviation of the prior; [trial, 3].
     tilts = np.linspace(-1, 1, 17) * _TILT_PRIOR_RAD
     trial_planes = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
+    # Heights of the plates on each trial plane, [trial, plate].
     guesses = trial_planes @ design.T
     heights = phases[plates_with_phase] / rad_per_m
     phasors = np.exp(2j * np.pi * (heights - guesses) / ambiguity_m)
     common_height = np.angle(np.mean(phasors, axis=1)) / (2 * np.pi) * ambiguity_m
-    # First onto one plane near that of the ranges, then together by as many whole turns as bring them nearest to it.
+    # Multiples of the ambiguity are added: first those that bring the heights to the trial plane moved by their common
+    # height, then one for all plates, which brings them nearest to the trial plane itself. [trial, plate]
     lifted = heights + ambiguity_m * np.round((guesses + common_height[:, None] - heights) / ambiguity_m)
     lifted += ambiguity_m * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / ambiguity_m)[:, None]
-    # The matrix depends on the places alone, so one solution serves all trial tilts.
+    # Fit a plane with the prior to each trial's heights. The matrix depends only on the places, and is the same for all
+    # trials.
     precision = np.array([0.0, *prior.std**-2])
     mean = np.array([0.0, *prior.mean])
     weighted = design / _PHASE_STD_M**2
@@ -528,7 +539,7 @@ def _fit_plane_by_phase(
     phase_plane, phase_covariance = _fit_plane(places[has_phase], phase_heights[has_phase], phase_stds, prior)
     residual = phase_heights[has_phase] - _evaluate_plane(phase_plane, places[has_phase])
     on_one_plane = float(np.sqrt(np.mean((residual * rad_per_m) ** 2))) < _PHASE_FITS_RAD
-    # Thin sheets have a phase of reflection of their own: the plane is accepted only if it agrees with the ranges.
+    # The reflection of thin sheets has another phase: the plane is accepted only if it agrees with the ranges.
     tolerance = 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, _TILT_TOLERANCE, _TILT_TOLERANCE]
     agrees_with_ranges = bool((np.abs(phase_plane - plane) < tolerance).all())
     if on_one_plane and agrees_with_ranges and float(np.hypot(*phase_plane[1:])) < _MAX_RISE_BY_PHASE:
@@ -541,16 +552,19 @@ def _fit_most(
 ) -> NDArray[np.float64]:
     """Return the heights at the places [patch] of the plane on which most plates lie.
 
-    Of planes through each plate, with tilts up to two standard deviations of the prior, the one with the least cost:
-    squared distances in standard deviations, up to `_LEVEL_STDS` (MSAC; Torr and Zisserman, CVIU 78, 2000).
+    Trial planes go through each plate, with tilts up to two standard deviations of the prior. The plane with the least
+    cost is taken (MSAC; Torr and Zisserman, CVIU 78, 2000):
+
+        cost = sum over plates of min(distance^2 / std^2, _LEVEL_STDS^2) + squared tilt in standard deviations
     """
-    in_stds = np.linspace(-2, 2, 33)
-    off_mean = np.stack(np.meshgrid(in_stds, in_stds), axis=-1).reshape(-1, 2)
-    rises = (tilt.mean + off_mean * tilt.std) @ places.T
+    # Trial tilts along x and y, in standard deviations from the mean, [tilt, 2].
+    steps = np.linspace(-2, 2, 33)
+    trial_tilts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    rises = (tilt.mean + trial_tilts * tilt.std) @ places.T
     # Height at the middle of the tilted plane through each plate, [tilt, plate].
     levels = heights - rises
-    prior = np.sum(off_mean**2, axis=1)
-    # [plate of the plane, tilt]. Plane by plane: a picture may have hundreds of patches.
+    prior = np.sum(trial_tilts**2, axis=1)
+    # [plate that the plane goes through, tilt]. One plate after the other, for memory: an image may have hundreds.
     cost = [
         prior + np.minimum(((levels - through[:, None]) / stds) ** 2, _LEVEL_STDS**2).sum(axis=1)
         for through in levels.T
@@ -564,8 +578,8 @@ def _fit_plane(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit a plane [3] (height at the middle, rise along x, along y); return it and its covariance [3, 3].
 
-    `heights` and `stds` [patch] are in metres. Height (`PRIOR_STD_M`) and `tilt` have a prior. The covariance is scaled
-    up if the scatter around the plane is larger than by the standard deviations of the heights.
+    `heights` and `stds` [patch] are in metres. The fit includes the priors of the height (`PRIOR_STD_M`) and of the
+    `tilt`. The covariance is scaled up if the scatter around the plane is larger than `stds` explain.
     """
     rows = np.column_stack([np.ones(len(places)), places]) / stds[:, None]
     precision = np.array([PRIOR_STD_M**-2, *tilt.std**-2])

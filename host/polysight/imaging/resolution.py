@@ -1,8 +1,9 @@
-"""Point response of an aperture (measured, by the POLySIGHT paper's formula, the geometry's limit), and field of view.
+"""Point response of an aperture, and its field of view.
 
-`compute_point_response` images a point in the middle of the scene with the aperture's taper and mask;
-`describe_imaging` gives the entry `imaging` of quality.json. `compute_field_limits` gives the field without ghosts, and
-the margin around flat plates.
+`compute_point_response` images a point in the middle of the scene with the aperture's taper and mask. It gives the
+width of the image, the limit of the geometry, and the width by the POLySIGHT paper's formula. `describe_imaging` gives
+the entry `imaging` of quality.json. `compute_field_limits` gives the field without ghosts, and the margin of aperture
+around flat plates.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from polysight_shared.config import Instrument
 from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Largest numbers of blocks of positions along a cut and across it. Along: blocks repeat the peak only about 24
-# resolution cells away. Against 96 blocks the published rig's widths are 0.1 % and its highest sidelobe 0.3 dB off;
-# at the end of the cut, at -43 dB, the level is up to 1.6 dB too high. Across it the path changes along the cut by
-# nearly the same at all positions (the difference is of second order): with 8 the widths of the published rig are
-# within 3e-4 of those with 24.
+# Positions are combined into blocks, for speed: at most this many along a cut through the image, and across it. Along:
+# 24 blocks repeat the peak only about 24 resolution cells away. Compared with 96 blocks, the published rig's widths
+# differ by 0.1 % and its highest sidelobe by 0.3 dB; at the end of the cut, at -43 dB, the level is up to 1.6 dB too
+# high. Across: the change of the path along the cut is nearly the same at all these positions (the difference is of
+# second order). With 8 blocks the widths of the published rig are within 3e-4 of those with 24.
 _BLOCKS_ALONG = 24
 _BLOCKS_ACROSS = 8
 # Number of resolution cells that are evaluated to either side of the peak, and of points per cell (chosen).
@@ -35,7 +36,7 @@ _CELLS_EACH_SIDE = 6.0
 _POINTS_PER_CELL = 20
 # Step of the numerical derivative of the phase slope, for the mirror zone; chosen.
 _STEP_M = 1e-4
-# Search for the nearest ghosts: largest distance, precision, and number of places that are tried; chosen.
+# Search for the nearest ghosts: largest distance, precision, and number of places of the object; chosen.
 _MAX_DISTANCE_M = 20.0
 _PRECISION_M = 1e-6
 _PLACES = 5
@@ -47,18 +48,19 @@ _HALF_POWER = np.sqrt(0.5)
 class PointResponse:
     """Response to a point in the middle of the image, for (x, y).
 
-    All figures of an axis are infinite if `limit_mm` would be wider than the image: nothing is resolved along it, and
-    the figures, which hold for a small part of the plane, would mean nothing.
+    All figures of an axis are infinite if `limit_mm` would be wider than the image: nothing is resolved along it. The
+    figures hold for a small part of the plane only, and would be meaningless.
 
     Attributes
     ----------
     width_mm
-        Measured between the half-power points, with the actual taper and missing positions; all frequencies count the
-        same.
+        Width of the image of a point between its half-power points, with the actual taper and missing positions; all
+        frequencies have the same weight.
     limit_mm
-        Limit of the geometry: 0.886 over the spread of `(sin theta_tx + sin theta_rx) / lambda` along the aperture
-        (half-power width of an evenly filled band); for a plane at height h about 0.886 lambda h / (2 L cos^3) in x and
-        / (2 L cos) in y, with L the aperture's length there and cos that of the incidence angle.
+        Limit of the geometry, 0.886 / spread of `(sin theta_tx + sin theta_rx) / lambda` along the aperture: the
+        half-power width of an evenly filled band. For a plane at the distance h it is about 0.886 lambda h / (2 L
+        cos^3(theta)) in x and 0.886 lambda h / (2 L cos(theta)) in y, with L the aperture's length along the axis and
+        theta the incidence angle.
     paper_mm
         The paper's formula `r lambda / L` (section 6.1) with r the plane's distance.
     sidelobe_db
@@ -123,7 +125,7 @@ def _combine_positions(
 def compute_limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
     """Return the half-power width at `point` [3] along an axis, m, from the spread of wavenumbers in the aperture.
 
-    It is that of the middle row or column and the first RX; infinite if that line has one position.
+    It is computed for the middle row or column and the first RX; infinite if that line has one position.
     """
     middle = tuple(n // 2 for n in aperture.offsets_m.shape[:2])
     if axis == 0:
@@ -136,7 +138,7 @@ def compute_limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -
         slope += difference[:, axis] / np.linalg.norm(difference, axis=1)
     # Cycles per metre.
     wavenumber_range = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
-    # A uniform aperture's image of a point falls to half its power within 0.886 / range.
+    # With a uniform aperture, the image of a point has the half-power width 0.886 / range.
     if wavenumber_range > 0:
         return float(0.886 / wavenumber_range)
     return float("inf")
@@ -173,7 +175,7 @@ def _compute_cut(
 
 
 def _measure_width(cut: NDArray[np.float64]) -> float:
-    """Return the half-power width in points; infinite if it is never reached on a side."""
+    """Return the half-power width of a cut in points; infinite if a side does not fall to half of the power."""
     middle = cut.size // 2
     sides = []
     for side in (cut[middle:], cut[middle::-1]):
@@ -186,7 +188,10 @@ def _measure_width(cut: NDArray[np.float64]) -> float:
 
 
 def _measure_sidelobe_db(cut: NDArray[np.float64]) -> float:
-    """Return the strongest value beyond the first minimum on either side, dB; without a minimum, the end's value."""
+    """Return the strongest value after the first minimum on either side of the peak, dB.
+
+    A side without a minimum counts with its last value.
+    """
     middle = cut.size // 2
     levels = []
     for side in (cut[middle:], cut[middle::-1]):
@@ -206,9 +211,9 @@ def describe_imaging(builder: ImageBuilder, images: Images) -> dict[str, BoardIm
 def describe_board(board: BoardSamples) -> BoardImaging:
     """Return the figures of one board.
 
-    `masked` is the share of the tapered aperture without data, `loss_db` the loss that it causes in the sum of a
-    point's echoes, `-20 log10(1 - masked)`. Image amplitudes do not change, for images are
-    divided by the weight of valid positions.
+    `masked` is the share of the tapered aperture without data. `loss_db` is the loss that it causes in the sum of a
+    point's echoes, `-20 log10(1 - masked)`. The amplitudes of images do not change, because images are divided by the
+    weight of valid positions.
     """
     weights = board.weights
     masked = 1 - float(weights.sum() / board.taper.sum())
@@ -224,7 +229,7 @@ def describe_board(board: BoardSamples) -> BoardImaging:
     response = compute_point_response(board.aperture, weights)
     return msgspec.structs.replace(
         facts,
-        # Zero is added because a loss of -0.0 would be written so.
+        # Adding zero turns -0.0 into 0.0.
         loss_db=round(-20 * float(np.log10(1 - masked)), 4) + 0.0,
         point_width_mm=_round_pair(response.width_mm),
         point_limit_mm=_round_pair(response.limit_mm),
@@ -239,11 +244,12 @@ def _round_pair(pair: tuple[float, float]) -> Pair:
     return x, y
 
 
-# Limits of the field of view: the alias-free field for a step size, and the mirror zone around flat plates. TX and RX
-# move together, so an echo's phase slope against stage offset, `k (sin a_tx + sin a_rx)`, depends only on the object's
-# place relative to the stage. Samples `d` apart cannot distinguish slopes that differ by `2 pi / d`: an object has a
-# ghost at each place whose slope differs by a multiple of that. The nearest ghost counts, seen from the middle half of
-# the aperture, because the taper suppresses the rest.
+# Limits of the field of view: the alias-free field for a step size, and the mirror zone around flat plates. The phase
+# slope of an echo is the change of its phase per metre of stage offset, k (sin a_tx + sin a_rx), with a the angles from
+# the normal of the plane. TX and RX move together, so that it depends only on the object's place relative to the stage.
+# Samples d apart cannot distinguish slopes that differ by 2 pi / d: an object has a ghost at each place whose slope
+# differs by a multiple of that. The limit is the distance to the nearest ghost, seen from the middle half of the
+# aperture, because the taper suppresses the rest.
 
 
 @dataclass(frozen=True)
@@ -291,7 +297,7 @@ def compute_field_limits(rig: Instrument) -> FieldLimits:
     for axis, (count, step_mm) in enumerate(((grid.columns, grid.step_x_mm), (grid.rows, grid.step_y_mm))):
         slope = PhaseSlope(rig, axis)
         change = (slope.slope(_STEP_M, (low + high) / 2) - slope.slope(-_STEP_M, (low + high) / 2)) / (2 * _STEP_M)
-        # The phase, change / 2 times the squared distance, is pi at the edge of the zone.
+        # At the edge of the zone, at the distance r, the phase change r^2 / 2 is pi.
         zone.append(1e3 * float(np.sqrt(2 * np.pi / change)))
         size_m = (count - 1) * step_mm / 1e3
         places = np.linspace(-size_m / 4, size_m / 4, _PLACES)

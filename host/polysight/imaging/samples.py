@@ -5,17 +5,21 @@ selects. The samples of an ideal mirror on the object plane (`mirror_samples`) g
 divided.
 
 Range gate (`reduction`): the 192 samples x_t of a chirp, at the frequencies f_t and relative to the direct path, become
-the few frequency samples that describe the scene. A pixel is the matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d
-/ c)` with the window w_t at its excess path d, the path beyond the direct one. All d lie in a gate `[d_1, d_2]` of few
-range cells. The functions `exp(-j 2 pi f d / c)` of d in this gate, f in the swept band B, span a space of about `B
-(d_2 - d_1) / c + 1` dimensions (Landau and Pollak 1962), so each is a combination of those at a few evenly spaced f_m:
-`exp(-j 2 pi f_t d / c) w_t = sum_m M_mt exp(-j 2 pi f_m d / c)`, with M from least squares over the gate. Then `S(d) =
-sum_m (M x)_m exp(-j 2 pi f_m d / c)`, and `M x` is computed once per position; the imagers use only M x at f_m. Six
-samples more than the time-bandwidth product make the error 1e-6 of the peak (derivation:
-docs/decisions/0002-imaging.md).
+the few samples that describe the scene. A pixel is the matched filter at its excess path d (beyond the direct path):
 
-Rows of raw chirps come decimated, with one sample for every four (`sync.decimate`). `Reduction.maps` gives the maps for
-them: those that agree best with the maps of all samples.
+    S(d) = sum_t w_t x_t exp(-j 2 pi f_t d / c)          window w_t
+
+All d lie in a gate [d_1, d_2] of few range cells. With the swept band B, the functions exp(-j 2 pi f d / c) of d in the
+gate span about B (d_2 - d_1) / c + 1 dimensions (Landau and Pollak 1962): each is a combination of those at a few
+evenly spaced f_m, with M from least squares over the gate.
+
+    w_t exp(-j 2 pi f_t d / c) = sum_m M_mt exp(-j 2 pi f_m d / c),  so  S(d) = sum_m (M x)_m exp(-j 2 pi f_m d / c)
+
+M x is computed once per position; the imagers use only M x at f_m. Six samples more than the time-bandwidth product
+make the error 1e-6 of the peak (derivation: docs/decisions/0002-imaging.md).
+
+Rows of raw chirps are decimated first, to one sample for every four (`sync.decimate`). `Reduction.maps` gives the maps
+for these: those that agree best with the maps for all samples.
 
 The direct path is a constant in x, close to the gate. Windowing alone does not remove it, so its amplitude is estimated
 (generalised least squares with the gate as coloured noise) and subtracted.
@@ -40,9 +44,9 @@ from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# `Reduction.maps` is fitted to echoes from `_MARGIN_M` before the direct path to `_MARGIN_M` behind the gate, and at
-# least to `_PASSED_M` behind the band's middle (decimation passes 1 m); `_ECHO` is their amplitude relative to the
-# noise (chosen).
+# `Reduction.maps` is fitted to echoes at excess paths from -_MARGIN_M to _MARGIN_M behind the gate, and at least to
+# _PASSED_M behind the middle of the paths that decimation passes (it passes 1 m). _ECHO is the echoes' amplitude
+# relative to the noise (chosen).
 _MARGIN_M = 0.1
 _PASSED_M = 1.0
 _ECHO = 30.0
@@ -51,7 +55,8 @@ _NOISE_POWER = 1e-3
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)
-# Largest number of multiplications of a matrix product: for more, OpenBLAS copies both matrices first, a fifth slower.
+# Largest number of multiplications in one matrix product: above it OpenBLAS first copies both matrices, which takes a
+# fifth longer.
 _MAX_PRODUCT = 1_000_000
 # The columns of such a product fill groups of this size: 22 columns take an eighth longer than 24 (OpenBLAS, AVX2).
 _COLUMN_GROUP = 8
@@ -66,8 +71,8 @@ class Reduction:
     frequencies_hz
         float64 [m].
     matrix
-        complex128 [m, sample]: window, removal of the direct path and projection. Samples outside the linear part have
-        weight 0.
+        complex128 [m, sample]: removal of the direct path, then M of the module. Samples outside the linear part have
+        the weight 0.
     direct
         complex128 [sample]: `direct @ x` is the amplitude of the direct path.
     model
@@ -88,16 +93,16 @@ class Reduction:
     def maps(self, sweep_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return matrix and direct for samples at `sweep_hz`, complex128 [m + 1, sample]: all, or one for every four.
 
-        Maps for decimated samples are fitted by least squares to noise and echoes. Their results differ from those for
-        all samples by 3e-4 in echoes that decimation passes (up to 1 m behind the direct path) and by 2e-4 in echoes
-        within the gate; in white noise by 0.2 to 0.4 %, 2 % at the first and last frequency, which the window makes
-        weak (0.06 % in the matched filter), and 5 % in the amplitude of the direct path (published chirp).
+        Maps for decimated samples are fitted by least squares to noise and echoes. Differences of their results from
+        those for all samples (published chirp): 3e-4 for echoes that decimation passes (up to 1 m behind the direct
+        path), 2e-4 for echoes within the gate. For white noise 0.2 to 0.4 %; 2 % at the first and last frequency, which
+        the window makes weak (0.06 % in the matched filter); 5 % in the amplitude of the direct path.
         """
         maps = np.vstack([self.matrix, self.direct])
         if sweep_hz.shape == self.sweep_hz.shape:
             return maps
         step_hz = self.sweep_hz[1] - self.sweep_hz[0]
-        # The chirp's samples that were decimated: each result lies in the middle of `FOLD`.
+        # The chirp's samples that were decimated: each result is in the middle of `FOLD` samples.
         first = round((sweep_hz[0] - self.sweep_hz[0]) / step_hz - (FOLD - 1) / 2)
         linear = slice(first, first + FOLD * sweep_hz.size)
         # Decimation passes paths about `middle_m`, half way between the direct path (0) and the middle of the gate.
@@ -132,7 +137,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     band = sweep[-1] - sweep[0]
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
     frequencies = np.linspace(sweep[0], sweep[-1], int(np.ceil(product)) + extra)
-    # Dense (chosen), so that the fits hold between them. `rcond` drops combinations that differ only by rounding.
+    # Paths so close (chosen) that the fits hold between them. `rcond` drops combinations that differ only by rounding.
     delay_s = np.linspace(*gate_m, max(64, 8 * frequencies.size)) / SPEED_OF_LIGHT_M_S
     target = np.exp(-2j * np.pi * np.outer(delay_s, sweep)) * weight
     basis = np.exp(-2j * np.pi * np.outer(delay_s, frequencies))
@@ -143,7 +148,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     direct = np.linalg.solve(covariance, np.ones(b - a)).conj()
     direct /= direct.sum()
 
-    # The direct path is a constant in x: the estimated one is subtracted before the projection `m`.
+    # The direct path is a constant in x. Its estimate `direct @ x` is subtracted from each sample before the map `m`.
     matrix = np.zeros((frequencies.size, chirp.samples), complex)
     matrix[:, a:b] = m - np.outer(m.sum(axis=1), direct)
     direct_of_all = np.zeros(chirp.samples, complex)
@@ -192,7 +197,7 @@ def choose_imager(aperture: geometry.Aperture) -> tuple[Imager, str | None]:
 
 
 def mirror_samples(antennas: geometry.Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
-    """Return a mirror's samples [rx, sample]: phase relative to the direct path, amplitude to a path of one metre."""
+    """Return a mirror's samples [rx, sample]: phase relative to the direct path, amplitude 1 / path in metres."""
     path = antennas.mirror_m(z_m)
     phase = 2j * np.pi * np.outer(path - antennas.direct_m, sample_frequencies_hz(chirp)) / SPEED_OF_LIGHT_M_S
     return (np.exp(phase) / path[:, None]).astype(np.complex128)
@@ -262,7 +267,7 @@ class BoardSamples:
         # Reduced samples [rx, frequency, row, column] and the direct path [rx, row, column], as received.
         self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
         self._direct = np.zeros((rx, *shape), np.complex64)
-        # Rows in which each RX gave a signal, [rx, row]; where not, its samples are zero in the whole row.
+        # True for rows in which an RX has a signal, [rx, row]; otherwise its samples are zero in the whole row.
         self.has_rx = np.zeros((rx, shape[0]), bool)
         # Phase by which the samples of each row are turned in images, complex [row]; 1: as recorded.
         self._turns = np.ones(shape[0], np.complex64)
@@ -303,9 +308,9 @@ class BoardSamples:
 
     @property
     def used_rx(self) -> NDArray[np.bool_]:
-        """RX that the image is made of, bool [rx]: those with a signal in the most rows.
+        """RX that the image uses, bool [rx]: those with a signal in the largest number of rows.
 
-        Another one's rows would give part of the aperture more weight, and plates a halo.
+        The rows of another RX would give a part of the aperture more weight, and plates a halo.
         """
         rows = self.has_rx.sum(axis=1)
         return np.asarray(rows == rows.max())
@@ -319,7 +324,8 @@ class BoardSamples:
     def _rx_factors(self) -> NDArray[np.complex64]:
         """Return the turn of each row over the gain of each RX, [rx, row]; 0 if the RX is not used, or the row is not.
 
-        If an RX dies within the scan, the others' gains change: samples are referenced to the mean of the live RX.
+        Samples are relative to the mean direct path of the RX with a signal. If an RX fails during the scan, this mean
+        changes, and with it the gains of the others.
         """
         rows_used = self.usable.any(axis=1)
         direct = (self._direct * self.valid).sum(axis=2, dtype=np.complex128)
@@ -327,7 +333,7 @@ class BoardSamples:
         for has_rx in np.unique(self.has_rx[:, rows_used], axis=1).T:
             rows = rows_used & (self.has_rx == has_rx[:, None]).all(axis=0)
             gains = direct[:, rows].sum(axis=1) / self.valid[rows].sum() * self._antennas.direct_m
-            # Samples without any direct path are as they should be.
+            # Without a direct path there is no gain to remove.
             gains[gains == 0] = 1
             factors[:, rows] = (self.used_rx / gains)[:, None]
         return factors * self._turns
@@ -413,7 +419,7 @@ class BoardSamples:
 
     def _apply_gate(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
-        # In the order of memory: the product of an array with reversed positions is slow.
+        # Reversed positions are put into the order of memory: their product would be slow.
         if samples.strides[1] < 0:
             return self._apply_gate(samples[:, ::-1], sweep_hz)[..., ::-1]
         if sweep_hz.size not in self._maps:
@@ -450,13 +456,13 @@ class BoardSamples:
         self._invalidate()
 
     def copy_samples(self, coarse: BoardSamples, steps: tuple[int, int]) -> None:
-        """Copy the samples of a coarser scan, one for every `steps` (rows, columns) of this; others stay missing."""
+        """Copy the samples of a coarser scan, one for every `steps` (rows, columns) of this; others are missing."""
         rows, columns = steps
         self._cube[:, :, ::rows, ::columns] = coarse._cube
         self._direct[:, ::rows, ::columns] = coarse._direct
         self.valid[::rows, ::columns] = coarse.usable
         self.has_rx[:, ::rows] = coarse.has_rx
-        # Positions between are evenly spaced; a row between two has the shift of the one before.
+        # Positions between recorded ones are evenly spaced; a row between two has the shift of the one before.
         count_y = len(self.valid)
         count_x = len(self.valid[0])
         column_index = np.arange(count_x) / columns
@@ -472,7 +478,7 @@ class BoardSamples:
         self._invalidate()
 
     def turn_rows(self, angles_rad: NDArray[np.float64]) -> None:
-        """Turn the phase of all samples of each row, [row], in every image formed from now on; the last call counts."""
+        """Turn the phase of each row's samples, [row], in images formed later; replaces the turns of earlier calls."""
         turns = np.exp(1j * angles_rad).astype(np.complex64)
         if not np.array_equal(turns, self._turns):
             self._turns = turns
@@ -510,9 +516,9 @@ class BoardSamples:
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
 
     def rx_calibration(self) -> NDArray[np.complex128]:
-        """Return the complex gain of each RX, [rx]: mean direct path of valid positions times its length; 1 if none.
+        """Return the complex gain of each RX, [rx]: the mean direct path of usable positions times its length.
 
-        NaN for an RX that is not used.
+        It is 1 without a direct path, and NaN for an RX that is not used.
         """
         total = (self._direct * self.usable).sum(axis=(1, 2), dtype=np.complex128)
         gain = total / max(1, int(self.usable.sum())) * self._antennas.direct_m
@@ -569,8 +575,8 @@ class BoardSamples:
     def range_profile(self, point_m: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Return the matched filter for paths longer by `shifts_m` than that of a point, complex64 [shift].
 
-        All positions are focused on `point_m` [3], rig frame. An echo from there has its peak at 0, echoes from behind
-        it at positive shifts.
+        All positions are focused on `point_m` [3], rig frame. An echo from there has its peak at the shift 0, echoes
+        from behind it at positive shifts.
         """
         relative_m = point_m - self._offsets.reshape(-1, 3)
         weights = (self.weights / self.count).ravel()
@@ -605,7 +611,7 @@ class BoardSamples:
         """Return the change of ln(image / footprint) from the first to the last frequency, complex64 [ny, nx].
 
         NaN where no echo is seen. For an echo that grows as 1 + s (f - f0) the slope of :meth:`range_slope` exceeds the
-        mirror's by -j 2 pi s var(f) / c, where the window's var(f) follows from the mirror's own second derivative.
+        mirror's by -j 2 pi s var(f) / c. The variance var(f) of the window follows from the mirror's second derivative.
 
         Parameters
         ----------
@@ -619,7 +625,7 @@ class BoardSamples:
         sweep_per_m = -2j * np.pi * (f[-1] - f[0]) / SPEED_OF_LIGHT_M_S
         with np.errstate(divide="ignore", invalid="ignore"):
             mirror_change = mirror_slope / footprint
-            # Times (-j 2 pi / c)^2, as the slopes are times -j 2 pi / c.
+            # var(f) times (-j 2 pi / c)^2.
             variance = mirror_bend / footprint - mirror_change**2
             change = (slope / image - mirror_change) / variance * sweep_per_m
         return np.where(np.isfinite(change), change, complex(np.nan, np.nan)).astype(np.complex64)

@@ -1,10 +1,14 @@
 """Reconstruct the missing positions of sparse scans, iteratively with an imager and its adjoint.
 
-The matched filter of a thinned grid contains aliases. In mostly empty scenes they can be removed: FISTA (Beck and
-Teboulle, SIAM J. Imaging Sci. 2, 2009) finds the image x that minimises `1/2 |W (G A x - y)|^2 + threshold |x|_1`, with
-the imager's forward model A, the effect G of the range gate on an echo, and the weights W of the positions.
-`fill_missing` predicts the samples of the missing positions from x; recorded samples are not changed, so that a whole
-scan does not change. Some recorded positions are left out of a first fit: their prediction gives the error.
+The matched filter of a scan with few positions contains aliases. In mostly empty scenes they can be removed: FISTA
+(Beck and Teboulle, SIAM J. Imaging Sci. 2, 2009) finds the image x that minimises
+
+    1/2 |W (G A x - y)|^2 + threshold |x|_1
+
+with the samples y, the imager's forward model A, the effect G of the range gate on an echo, and the weights W of the
+positions. `fill_missing` predicts the samples of the missing positions from x. Recorded samples are not changed, so
+that a whole scan remains the same. To estimate the error, a first fit leaves out some recorded positions, whose
+prediction is compared with their samples.
 """
 
 from __future__ import annotations
@@ -26,17 +30,18 @@ from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
 
 STRENGTH = 0.002
-"""Found with simulated plates (docs/decisions/0002-imaging.md): a larger value removes plates with a weak V reflection,
-a smaller one leaves more aliases.
+"""Threshold relative to the strongest pixel, found with simulated plates (docs/decisions/0002-imaging.md): a larger
+value removes plates with a weak V reflection, a smaller one leaves more aliases.
 """
 ITERATIONS = 40
 """Steps of the first fit of missing positions; the second fit starts from its image and takes half as many; chosen."""
 MOST_ADDED = 4
-"""Largest number of steps into which a step between positions is divided; chosen."""
+"""Largest number of parts into which a step between positions is divided; chosen."""
 TEST_SHARE = 10
 """One in this number of recorded rows, columns or positions is left out of the first fit, to test the prediction;
 chosen."""
-# The power iteration comes from below: after 12 rounds 5 % are added (chosen), so that the estimate is not too small.
+# The power iteration approaches the eigenvalue from below: after 12 rounds 5 % are added, so that the estimate is not
+# too small; both chosen.
 _POWER_ROUNDS = 12
 _EIGENVALUE_MARGIN = 1.05
 
@@ -93,19 +98,19 @@ def reconstruct(
     iterations
         Number of steps, each one forward and one adjoint imaging; the default is chosen.
     strength
-        Weight of sparsity relative to the strongest pixel of the matched filter: pixels below about this level become
-        0, and the others weaker by as much. For a few points with many random omissions 0.01 converges faster.
+        Threshold relative to the strongest pixel of the matched filter: amplitudes are reduced by about this much, and
+        pixels below it become 0. For a few points with many random omissions 0.01 converges faster.
     selected
         bool [row, column]: positions to use; None: all that are valid.
     start
         complex64 [ny, nx]: image to start from; None: empty.
     """
     model = _Model(board)
-    # [rx, 1, row, column]: a dead RX has no weight.
+    # [rx, 1, row, column]; the weight of an RX that is not used is 0.
     weights = board.weights * board.used_rx[:, None, None, None]
     if selected is not None:
         weights = weights * selected
-    # The squares of these weigh the squared misfit.
+    # W: the squared misfit has the weights W^2.
     weights = np.sqrt(weights)
     data = board.calibrate_samples() * weights
 
@@ -116,14 +121,14 @@ def reconstruct(
         return model.adjoint(y * weights)
 
     matched = adjoint(data)
-    # Steps of 1 / lipschitz cannot overshoot. `threshold` is the module's, times the length of a step.
+    # Steps of 1 / lipschitz cannot overshoot. `threshold` is that of the module's formula times the length of a step.
     lipschitz = _estimate_largest_eigenvalue(lambda x: adjoint(forward(x)), matched)
     threshold = strength * float(np.abs(matched).max()) / lipschitz
     norm = float(np.linalg.norm(data)) or 1.0
     x = np.zeros_like(matched) if start is None else start
 
-    # FISTA (Beck and Teboulle, SIAM J. Imaging Sciences 2, 2009, equations 4.1 to 4.3): each step starts from a point
-    # ahead of the last image, in the direction of the last change.
+    # FISTA (equations 4.1 to 4.3): each step starts from the last image, extrapolated in the direction of its last
+    # change.
     extrapolated = x
     momentum = 1.0
     residuals = []
@@ -160,9 +165,9 @@ def _estimate_largest_eigenvalue(
 
 
 def find_added_steps(rig: Instrument) -> tuple[int, int]:
-    """Return into how many steps (row, column) those of a rig's grid are divided, so that its image has no ghosts.
+    """Return the numbers of parts into which the steps between (rows, columns) are divided, at most `MOST_ADDED`.
 
-    The image itself is the scene: ghosts of objects in it must lie outside. At most `MOST_ADDED`.
+    With them the image has no ghosts: those of objects inside the image lie outside.
     """
     free_mm = compute_field_limits(rig).alias_free_mm
     size_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
@@ -186,7 +191,7 @@ def fill_missing(
     Raises
     ------
     ConfigError
-        if positions are missing and the aperture needs the direct sum: its hundred images would take hours.
+        if positions are missing and the aperture needs the direct sum: about a hundred images would take hours.
     """
     steps = find_added_steps(builder.rig)
     filled = ImageBuilder(_divide_steps(builder.rig, steps), builder.taper, gate_m=builder.gate_m)
@@ -251,7 +256,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
 
 
 def _choose_test_positions(recorded: Mask) -> Mask:
-    """Return recorded positions to leave out of a fit: whole rows or columns if such are missing, otherwise any."""
+    """Return recorded positions to leave out of a fit: whole rows or columns if such are missing, else random ones."""
     rows = np.flatnonzero(recorded.any(axis=1))
     columns = np.flatnonzero(recorded.any(axis=0))
     tested = np.zeros_like(recorded)

@@ -1,14 +1,22 @@
 """Spectral imagers: for a plane parallel to the stage, imaging is a convolution.
 
-TX and RX move together, so the matched filter of a position u at a pixel v depends only on `v - u`:
-`image = sum over rx, f of g * k`, a convolution of the samples g with the kernel `k(x, y) = exp(-j 2 pi f d_rx / c)` of
-the excess path d_rx(x, y). All products are summed in the spectrum, and one inverse transform gives the image.
+The image is the matched filter of the samples g of all RX and frequencies f at all positions u of the stage:
 
-Along y, rows and pixels share a lattice on which the kernel is sampled, without interpolation. Along x each row has its
-own shift (travel of the stage within a burst, backlash), a phase ramp in the spectrum.
+    image(v) = sum over rx, f, u of  g(rx, f, u) kernel(rx, f, v - u)
+    kernel(rx, f, x, y) = exp(-j 2 pi f d_rx(x, y) / c)
+
+with v the pixel and d_rx the excess path, beyond the direct one. TX and RX move together, so that d_rx depends only on
+the *lag* v - u. A convolution is a product of spectra: the products of all RX and frequencies are summed in the
+spectrum, and one inverse transform gives the image.
+
+Along y, the rows of positions and of pixels lie on one lattice, on which the kernel is sampled without interpolation.
+Along x each row has its own shift (travel of the stage within a burst, backlash), which is a phase ramp in the
+spectrum. The kernel's period along x is made smooth by a cross-fade (`cross_fade`), so that few of its spectral bins k
+have energy: these are the *band*.
 
 A `Lattice` has the periods, pitches and strides of regular positions and pixels (docs/decisions/0002-imaging.md). The
-spectra of the kernels along x are computed here and cached in memory, for one aperture is imaged many times.
+spectra of the kernels along x are computed here and cached in memory, for one aperture is imaged many times. Arrays
+have the axes [rx * frequency] (*channel*), lag or row along y, and bin k along x.
 """
 
 from __future__ import annotations
@@ -36,22 +44,23 @@ from polysight.imaging.geometry import (
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Length of the cross-fade relative to the kernel's length in x, and its smallest length in columns. Chosen: a shorter
-# one has a wider spectrum, a longer one a longer period.
+# one makes the band wider, a longer one makes the period longer.
 _FADE_SHARE = 0.08
 _FADE_COLUMNS = 20
-# Relative to the kernel's strongest spectral bin: weaker ones are left out (chosen: more bins are slower).
+# The band has the spectral bins with at least this amplitude, relative to the strongest (chosen: more bins are slower).
 _LEAST_BIN = 1e-5
 KEEP_BYTES = 1 << 28
-"""Size of the cache: two boards of the published grid take 115 MB, 166 MB with the kernels of a live scan."""
+"""Size of the cache in bytes: two boards of the published grid take 115 MB, 166 MB with the kernels of a live scan."""
 # Lattices and kernels by key, the least recently used first.
 _cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 SLACK_M = 2e-3
 """Largest deviation of a row's start along x from the aperture; chosen: one step of the published grid."""
-# Amplitude relative to the strongest principal component: weaker ones are left out (chosen: 17 of the published rig's
-# 40 stay).
+# Principal components of the kernels with a smaller amplitude, relative to the strongest, are left out (chosen: 17 of
+# the published rig's 40 are kept).
 _LEAST_COMPONENT = 6e-6
-# Wavenumbers processed in double precision at a time: with 32 a live scan keeps 11 MB more, in no less time.
+# Number of bins k processed in double precision at a time: with 32 a live scan takes 11 MB more memory, and no less
+# time.
 _CHUNK = 8
 # Complex numbers in a cache line
 _CACHE_LINE = 8
@@ -66,15 +75,15 @@ class Lattice:
     size_x, pitch_x_m, stride_x
         Points and pitch of the kernel's period in x; columns are `stride_x` pitches apart.
     first_lag_m
-        Smallest exact `pixel - position` (x, y).
+        Smallest lag (x, y) at which the period holds the kernel itself.
     exact_x
-        Number of exact lags in x; the rest of the period is the cross-fade.
+        Number of lags in x at which it does; the rest of the period is the cross-fade.
     band
-        Signed spectral bins along x with kernel energy, [k].
+        Spectral bins along x with kernel energy, consecutive and signed, [k].
     size_y, pitch_y_m
         Points and pitch of the transform along y.
     row_stride, pixel_stride
-        Spacing of rows of positions and of rows of pixels, in pitches.
+        Spacing of rows of positions and of rows of pixels along y, in pitches.
     lags_y
         Number of lags in y.
     """
@@ -111,7 +120,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     offsets = aperture.offsets_m
     x = offsets[..., 0]
     y = offsets[:, 0, 1]
-    # Without a common pitch, and without a step in rows of one position, the lattice is that of the pixels.
+    # The pitch is that of the pixels if rows and pixels have no common one.
     pitch_y = pitch_y_m(aperture) or grid.pixel_m
     pixel_stride = round(grid.pixel_m / pitch_y)
     row_stride = round((y[1] - y[0]) / pitch_y) if y.size > 1 else 1
@@ -119,12 +128,13 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
 
     first = grid.x_m[0] - x.max() - slack_m
     last = grid.x_m[-1] - x.min() + slack_m
+    # Rows of one position have no step.
     step = measure_column_step_m(offsets) or grid.pixel_m
     exact_columns = (last - first) / step + 1
     # Number of columns of one period: the exact lags and the cross-fade.
     columns = _find_fast_length(math.ceil(exact_columns + max(_FADE_SHARE * exact_columns, _FADE_COLUMNS)))
     band = _find_band(aperture, first, last, step, columns)
-    # The period has at least as many points as the band has bins.
+    # band.size / columns, rounded up: a period needs at least as many points as the band has bins.
     stride_x = -(-band.size // columns)
     pitch = step / stride_x
     return Lattice(
@@ -143,7 +153,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
 
 
 def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = None) -> Iterator[Any]:
-    """Yield the delay of the excess path for lags `pixel - position` (x [nx], y [ny]), float64 [ny, nx], by RX."""
+    """Yield the delay of the excess path for lags x [nx] and y [ny], float64 [ny, nx] in seconds, for each RX."""
     a = aperture.antennas
     z = float(aperture.grid.z_m) - float(aperture.offsets_m[0, 0, 2])
     tx = xp.asarray(a.tx_m, device=device)
@@ -158,8 +168,11 @@ def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = Non
 def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
     """Return one period of a kernel [..., fade + size], whose first `fade` points precede the period.
 
-    At the end of the period the kernel is cross-faded into those points, which lead to its start. The smooth periodic
-    function has a narrow spectrum, so that phase ramps shift it by any fraction.
+    At the end of the period the kernel is cross-faded into those points, which lead to its start:
+
+        period = (1 - ramp) end of the kernel + ramp points before its start,   ramp from 0 to 1
+
+    The periodic function is smooth and has a narrow spectrum, so that phase ramps shift it by any fraction of a pitch.
     """
     fade = kernel.shape[-1] - size
     # The curve is within 2e-4 of 0 and 1 at its ends (published grid).
@@ -179,7 +192,7 @@ def _find_band(aperture: Aperture, first: float, last: float, step: float, colum
     y = aperture.offsets_m[:, 0, 1]
     # Largest possible wavenumber, cycles per metre
     fastest = 2 * aperture.frequencies_hz[-1] / SPEED_OF_LIGHT_M_S
-    # Two points a cycle would be enough; 2.2 leave room.
+    # Two points per cycle would be enough; 2.2 leave a margin.
     finer = max(1, math.ceil(2.2 * step * fastest))
     size = columns * finer
     fade = size - math.ceil((last - first) / step * finer) - 1
@@ -195,7 +208,7 @@ def _find_band(aperture: Aperture, first: float, last: float, step: float, colum
 
 
 def _list_runs(bins: NDArray[np.intp]) -> list[tuple[slice, slice]]:
-    """Return the runs of consecutive numbers in `bins`: their places, and the numbers."""
+    """Return the runs of consecutive numbers in `bins`: for each its slice of indices, and the slice of its numbers."""
     ends = [0, *(np.flatnonzero(np.diff(bins) != 1) + 1), bins.size]
     return [(slice(a, b), slice(int(bins[a]), int(bins[a]) + b - a)) for a, b in itertools.pairwise(ends)]
 
@@ -255,10 +268,10 @@ def kernel_key(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tu
 
 
 def spectra_along_x(aperture: Aperture, lattice: Lattice, lines: int, xp: Any = np, device: Any = None) -> Any:
-    """Return kernels `exp(-j 2 pi f d / c)` of `pixel - position` along x: complex64 [rx * frequency, lag y, k].
+    """Return the spectra of the kernels along x in the band: complex64 [rx * frequency, lag y, k].
 
-    One distance map per RX; a constant phase step leads from one frequency to the next. Lags are followed by zeros up
-    to the number of `lines`.
+    The delays are computed once per RX. Frequencies are evenly spaced, so that each kernel is the one before times a
+    phase step. Zeros follow the lags in y up to the number of `lines`.
     """
     n = lattice.size_x
     f = aperture.frequencies_hz
@@ -299,7 +312,7 @@ class RowSpectra:
         self.device = device
         key = lattice_key(aperture, slack_m)
         self.lattice: Lattice = get_cached(key, lambda: lattice(aperture, slack_m))
-        # Columns of a transform of rows; its spectrum repeats, so that each bin of the band is one of it.
+        # Columns in a period. The spectrum of rows repeats every `period` bins, so that it has each bin of the band.
         self.period = self.lattice.size_x // self.lattice.stride_x
         self._runs = _list_runs(self.lattice.band % self.period)
         self._origin = float(fit_row_starts_m(aperture.offsets_m).min())
@@ -349,7 +362,7 @@ class RowSpectra:
         count = self.lattice.band.size
         columns = self.aperture.offsets_m.shape[1]
         padding = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
-        # The band back at its bins of the kernel's period; bins a period of the rows apart are one bin of theirs.
+        # The band is put back to its bins of the kernel's period. Bins that are `period` apart are one bin of the rows.
         spectrum = xp.roll(xp.concat([spectra * xp.conj(ramps), padding], axis=-1), int(self.lattice.band[0]), axis=-1)
         folded = xp.sum(xp.reshape(spectrum, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
         return transform_in_place(xp, folded, axis=-1, inverse=True)[..., :columns] * self.period
@@ -371,19 +384,20 @@ class SpectralImager(RowSpectra):
         key = (xp.__name__, str(device), *lattice_key(aperture, slack_m))
         self._ramps = get_cached(("ramps", *key), lambda: self.ramps(fit_row_starts_m(aperture.offsets_m)))
         sizes = self.lattice
-        # The last constant echo and its kernel, of all imagers with the same kernels; empty before the first.
+        # The last constant echo and the sum of the kernels for it; shared by all imagers with the same kernels, and
+        # empty before the first echo.
         self._echoes: list[tuple[Any, Any]] = get_cached(self.key("echo", sizes.size_y), list)
         rows = aperture.offsets_m.shape[0]
         lines = aperture.grid.shape[0]
         # Lattice row of the first row of pixels.
         self._first_pixel_row = sizes.row_stride * (rows - 1)
         count = sizes.size_y // sizes.row_stride
-        # Rows are padded with zeros below. An odd number of cache lines apart, or they would all use the same places of
-        # the cache (transforms took 1.6 times as long).
+        # Rows, padded with zeros below. They are an odd number of cache lines apart in memory: otherwise all would use
+        # the same places of the cache (transforms took 1.6 times as long).
         pitch = _CACHE_LINE * (-(-sizes.band.size // _CACHE_LINE) | 1)
         padded_lines = self.xp.zeros((count, pitch), dtype=self.xp.complex64, device=device)
         self._padded_lines = padded_lines[:, : sizes.band.size]
-        # Spectrum along y: rows are `row_stride` pitches apart, so that theirs repeats as often in that of the lattice.
+        # Rows are `row_stride` pitches apart: their spectrum along y repeats `row_stride` times in that of the lattice.
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         # Lattice rows of positions, and of pixels.
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
@@ -422,7 +436,10 @@ class SpectralImager(RowSpectra):
         return self._sum_channels(put_spectra, factors)
 
     def _sum_channels(self, put_spectra: Callable[[int, int], None], factors: Any) -> Any:
-        """Return the image of all channels: `put_spectra` writes rows of an RX and frequency to the padded lines."""
+        """Return the image of all channels; `put_spectra` writes the rows of one RX and frequency to the padded lines.
+
+        It is the inverse transform of the sum over rx of factor times the sum over f of (spectrum times kernel).
+        """
         rx, m = self.aperture.shape[:2]
         shape = self._kernels.shape[1:]
         total = self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device)
@@ -481,6 +498,9 @@ class SpectralImager(RowSpectra):
 class IncrementalImager(RowSpectra):
     """Imager that adds row by row to the image.
 
+    At each bin k, a row adds kernel [ny, channel] @ spectra [channel]. The kernels of the channels are similar, so that
+    few principal components describe them all: this makes the product smaller (`_compute_principal_kernels`).
+
     Parameters
     ----------
     aperture
@@ -495,7 +515,8 @@ class IncrementalImager(RowSpectra):
         super().__init__(aperture, xp, device, SLACK_M)
         rows = aperture.shape[2]
         lines = aperture.grid.shape[0]
-        # Lag from the first row of positions to the first row of pixels, and the lags that pixels take from one row.
+        # Index of the lag in y from the first row of positions to the first row of pixels; number of lags from one row
+        # to all rows of pixels.
         self._first_pixel_row = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
         self._kernels, self._components = get_cached(self.key("rows"), self._compute_principal_kernels)
@@ -525,7 +546,7 @@ class IncrementalImager(RowSpectra):
         """Add a row that is transformed along x, [rx, frequency, k], and its weights, [k]."""
         xp = self.xp
         rx, m = self.aperture.shape[:2]
-        # Block diagonal [k, channel, rx], so that each RX keeps a column of its own.
+        # Block diagonal [k, channel, rx], so that each RX has a column of its own.
         spectra_by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
             spectra_by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
@@ -575,7 +596,8 @@ class IncrementalImager(RowSpectra):
         xp = self.xp
         rx = self.aperture.shape[0]
         size = (self.lattice.band.size, self.aperture.grid.shape[0])
-        # Spectra of the lines of pixels so far: of the samples [k, ny, rx], and of the constant echo [k, ny].
+        # Sums over the rows so far, spectra along x of the lines of pixels: those of the samples [k, ny, rx], and those
+        # of the constant echo [k, ny].
         self._sum = xp.zeros((*size, rx), dtype=xp.complex64, device=self.device)
         self._constant = xp.zeros(size, dtype=xp.complex64, device=self.device)
         channels = xp.reshape(xp.asarray(echo, dtype=xp.complex64, device=self.device), (-1,))[:, None]
@@ -587,12 +609,16 @@ class IncrementalImager(RowSpectra):
             self.add_row(index, samples[:, :, index, :], weights[index, :], float(start))
 
     def _find_lags(self, index: int) -> slice:
-        """Return the lags in y between a row of positions and every row of pixels."""
+        """Return the indices of the lags in y between a row of positions and every row of pixels."""
         first = self._first_pixel_row - index * self.lattice.row_stride
         return slice(first, first + self._span, self.lattice.pixel_stride)
 
     def _compute_principal_kernels(self) -> tuple[Any, Any]:
-        """Return kernels [k, lag, component], and the transform from channels, [k, component, channel]."""
+        """Return kernels [k, lag, component], and the transform from channels, [k, component, channel].
+
+        With K [lag, channel] the kernels at one bin, and V [channel, component] the strongest eigenvectors of K^H K,
+        these are K V and V^H: K is nearly K V V^H.
+        """
         xp = self.xp
         lattice = self.lattice
         channels = math.prod(self.aperture.shape[:2])
@@ -609,7 +635,7 @@ class IncrementalImager(RowSpectra):
             powers.append(powers_of_chunk)
             bases.append(xp.astype(vectors, xp.complex64))
         power = xp.concat(powers)
-        # Ascending: the last component is the strongest at every wavenumber
+        # Powers ascend: the last component is the strongest at every bin. The same number is kept at all bins.
         strongest = xp.max(power, axis=0)
         count = int(xp.sum(xp.astype(strongest > _LEAST_COMPONENT**2 * strongest[-1], xp.int64)))
         vectors_used = xp.concat([vectors[:, :, -count:] for vectors in bases])

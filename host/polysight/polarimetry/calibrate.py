@@ -10,8 +10,8 @@ orientation cannot separate leakage from gain**. Leakage is therefore given, or 
 
 A metal patch in the scene gives one number per channel (`calibrate`). A plate over the plane, scanned separately, gives
 one per pixel (`PlaneReference`), which also removes differences between H and V that vary over the plane (antenna
-patterns, illumination). Samples are referenced to the direct path, so that reference stays valid after a power cycle;
-geometry and boards must be the same, see :meth:`PlaneReference.check_rig`.
+patterns, illumination). Samples are relative to the direct path, so that this reference remains valid after a power
+cycle; geometry and boards must be the same, see :meth:`PlaneReference.check_rig`.
 
 Leakage is estimated from metal at two orientations (`estimate_leakage_from_images`). Metal strips with a pitch well
 below a wavelength reflect only the field along them. Strips rotated by psi from the vertical (s), flat on the plane at
@@ -21,15 +21,16 @@ strips reflect s alone, so V receives only leakage; horizontal strips reflect p 
 
 Thin free wires are a good approximation. Wires with a diameter of a tenth of their pitch d reflect about 0.025 d /
 wavelength of the field across them (Marcuvitz, Waveguide Handbook, section 5.18: 0.003 at 0.5 mm). They reflect the
-field along them less than a plate, a common factor without influence. A printed board is unsuitable, for its substrate
-reflects both polarisations.
+field along them less than a plate does, by a common factor without influence. A printed board is unsuitable, because
+its substrate reflects both polarisations.
 
-With the wave e of each standard known up to a factor (distance and size), and the measured pair m = (H, V),
+A *standard* is the plate, or strips at one orientation. Of each standard the reflected wave e = (s, p) is known and the
+pair m = (H, V) is measured, both but for a factor (distance and size):
 
-    m ~ [[g_h, g_h a], [g_v b, g_v]] e
+    m ~ M e,     M = [[g_h, g_h a], [g_v b, g_v]]
 
-is a homography of the projective line. Three different waves (the plate, and strips at two orientations) determine it
-up to one factor, by linear equations. More waves give a least-squares solution.
+m has the direction of M e, which is one linear equation for the entries of M. Three standards with different waves
+determine M but for a factor. More give a least-squares solution.
 """
 
 from __future__ import annotations
@@ -49,10 +50,10 @@ from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 
 def ratio(h: Image, v: Image) -> Image:
-    """Return the polarisation ratio h / v, complex, broadcast; NaN where it or one of both is not finite."""
+    """Return the polarisation ratio h / v, complex, broadcast; NaN where h, v or the ratio is not finite."""
     is_usable = (v != 0) & np.isfinite(v) & np.isfinite(h)
     quotient = np.full(np.broadcast_shapes(h.shape, v.shape), complex(np.nan, np.nan), np.result_type(h, v))
-    # Outside the footprint v may be the smallest number there is: a ratio that overflows is none.
+    # Outside the footprint v may be so small that the ratio overflows: it then becomes NaN.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         np.divide(h, v, out=quotient, where=is_usable)
     quotient[~np.isfinite(quotient)] = complex(np.nan, np.nan)
@@ -60,7 +61,7 @@ def ratio(h: Image, v: Image) -> Image:
 
 
 def inverse_spread(h: Image, v: Image) -> float:
-    """Return the standard deviation of V / H over pixels, of the real part and of the imaginary part (1.48 MAD)."""
+    """Return the standard deviation of V / H over pixels: that of the real and imaginary parts together (1.48 MAD)."""
     is_usable = np.isfinite(h) & np.isfinite(v) & (h != 0)
     if not is_usable.any():
         return float("nan")
@@ -77,10 +78,10 @@ def with_ratio(images: Images) -> Images:
 def measure_metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]:
     """Return the gains of H and V over a metal region (Eq. 8 and 9 of the paper).
 
-    Amplitudes are RMS values over the region, and the phase of the ratio is that of sum(h conj(v)): a common phase of
-    H and V (distance, tilt) has no influence, and weak pixels do not dominate, as in the mean of the pixel ratios.
-    The gain of V is real: only the phase of the ratio is referenced, for the phase of H and V alone is that of the
-    distance (Eq. 7).
+    Amplitudes are RMS values over the region, and the phase of the ratio is that of sum(h conj(v)). So a common phase
+    of H and V (distance, tilt) has no influence, and weak pixels do not dominate, as they would in the mean of the
+    pixels' ratios. The gain of V is real: only the phase of the ratio is removed, because the phase of each channel
+    alone is that of the distance (Eq. 7).
 
     `metal_mask` bool [ny, nx] is the inside of a metal region. Raises DataError if it is empty, not finite or dark, or
     has another shape than the images.
@@ -163,9 +164,9 @@ def correct_leakage(h: Image, v: Image, leak_hv: complex, leak_vh: complex) -> t
 def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
     """Filter a complex or real image [ny, nx] with a 2-D Gaussian against speckle (section 9.1 of the paper).
 
-    Pixels that are not finite do not spread and stay so: the filter is normalised by the weight of the finite pixels.
-    `sigma_px` in pixels; zero or less returns the image itself. Smooth H and V only after the phase of the distance was
-    removed: divided by the footprint, the image of a mirror in the plane.
+    Pixels that are not finite are not changed and do not affect others: the filter is normalised by the weight of the
+    finite pixels. `sigma_px` is the standard deviation in pixels; zero or less returns the image itself. Smooth H and V
+    only after the phase of the distance was removed by the division by the footprint, the image of a mirror.
     """
     if sigma_px <= 0:
         return image
@@ -178,16 +179,17 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
     return smoothed.astype(image.dtype)
 
 
-# Parameters of `plane_reference`: default width of the Gaussian window, and lowest level relative to the plate's 90th
-# percentile in each channel; chosen.
+# Default width (standard deviation) of the Gaussian window of `plane_reference`; chosen.
 SMOOTH_MM = 8.0
+# Lowest level of metal in each channel, relative to the 90th percentile of the plate; chosen.
 FLOOR_DB = -10.0
 # A smaller area of metal is not a plate that covers the plane; chosen.
 MIN_PIXELS = 100
-# V / H of pixels that are not metal, relative to the brightest ones, and the share of the pixels bright in H that may
-# be so. Dielectrics of up to eps = 9 have -7.4 dB or less. On metal plates gains differ by up to 5 dB; in scenes of
-# copper and other plates 8 to 40 % of the pixels have -7 dB (all simulated).
+# Pixels with a lower V / H, relative to the brightest ones, are not metal. Dielectrics of up to eps = 9 have -7.4 dB or
+# less. On metal plates gains differ by up to 5 dB (simulated).
 OTHER_MATERIAL_DB = -7.0
+# Largest share of such pixels, of those that are bright in H, in a scan of metal alone. Scenes of copper and other
+# plates have 8 to 40 % (simulated).
 OTHER_MATERIAL_SHARE = 0.03
 
 
@@ -230,7 +232,7 @@ class PlaneReference:
     rise: Rise = (0.0, 0.0)
 
     def add_dispersion(self, dispersion: Dispersion) -> PlaneReference:
-        """Return the reference with the plate's change over the sweep, from the same scan; unchanged if it has none."""
+        """Return the reference with the plate's change over the sweep, from the same scan, if it is known."""
         is_known = self.valid & np.isfinite(dispersion.h) & np.isfinite(dispersion.v)
         if not is_known.any():
             return self
@@ -322,13 +324,14 @@ def _measure_variation_db(gain: Image) -> float:
 def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = "") -> PlaneReference:
     """Make a reference from the images of a metal plate over the plane.
 
-    Amplitudes and H conj(V) are averaged over a Gaussian window, so a common phase of both channels (distance and tilt
-    of the plate) has no influence. A pixel is valid if both channels exceed `FLOOR_DB` within two widths of the window.
+    Powers and H conj(V) are averaged over a Gaussian window, so that a common phase of both channels (distance and tilt
+    of the plate) has no influence. A pixel is valid if both channels exceed `FLOOR_DB` everywhere within two widths of
+    the window.
 
     The window has the width (standard deviation) `smooth_mm`: the gains vary slowly, speckle does not.
     `name` is the scan, for the report.
 
-    Raises DataError if the image shows no metal, or other materials beside it.
+    Raises DataError if the image shows no metal, or other materials in addition to it.
     """
     h = images.h
     v = images.v
@@ -392,7 +395,7 @@ def _make_disk(radius: int) -> npt.NDArray[np.bool_]:
 PLATE = (1.0, 1.0)
 """The s and p reflected by a metal plate."""
 MIN_CONDITION = 0.02
-"""Smallest ratio of third to first singular value: below it the waves do not determine three unknowns; chosen."""
+"""Smallest ratio of the third to the first singular value. Below it the waves are too similar; chosen."""
 # s and p, or H and V.
 Wave = tuple[complex, complex]
 
@@ -404,9 +407,9 @@ class MetalStandard:
     Attributes
     ----------
     measured
-        H and V, up to a common factor, also a complex one (:func:`common_direction`).
+        H and V but for a common complex factor (:func:`common_direction`).
     wave
-        Reflected s and p, up to a factor: :data:`PLATE` or :func:`strips_wave`.
+        Reflected s and p but for a factor: :data:`PLATE` or :func:`strips_wave`.
     """
 
     measured: Wave
@@ -424,7 +427,7 @@ class Leakage:
     imbalance
         g_h / g_v, complex.
     residual
-        RMS misfit of the standards, as an angle in radians; zero if there are only as many as unknowns.
+        RMS misfit of the standards, as an angle in radians; zero for three standards, as many as unknowns.
     """
 
     h: complex
@@ -461,7 +464,7 @@ def strips_wave(psi_rad: float, theta_rad: float) -> Wave:
 
 
 def common_direction(h: Image, v: Image, mask: Mask | None = None) -> Wave:
-    """Return the common pair (H, V) of pixels, up to a factor: the first eigenvector of their 2 x 2 covariance.
+    """Return the common pair (H, V) of pixels but for a factor: the first eigenvector of their 2 x 2 covariance.
 
     A common phase or amplitude of both channels may vary from pixel to pixel.
 
@@ -513,7 +516,7 @@ def estimate_leakage(standards: Sequence[MetalStandard]) -> Leakage:
         ],
         axis=1,
     )
-    # The entries are determined up to one factor: the singular vector of the smallest, fourth singular value.
+    # The entries, but for a factor, are the singular vector of the smallest, fourth singular value.
     _, sizes, vh = np.linalg.svd(rows)
     if sizes[2] < MIN_CONDITION * sizes[0]:
         raise DataError(
@@ -523,9 +526,9 @@ def estimate_leakage(standards: Sequence[MetalStandard]) -> Leakage:
             code=ErrorCode.VALUES_CONFLICT,
         )
     g_h, g_ha, g_vb, g_v = vh[3].conj() * np.array([scale[0], scale[0], scale[1], scale[1]])
-    # (H, V) by the estimate, [standard, 2], scaled as `measured`.
+    # (H, V) that the estimate predicts, [standard, 2], scaled like `measured`.
     predicted = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ waves.T).T
-    # Sine of the angle between the measured pair and that of the estimate, for each standard.
+    # Sine of the angle between the measured and the predicted pair, [standard].
     sine = np.abs(measured[:, 1] * predicted[:, 0] - measured[:, 0] * predicted[:, 1]) / np.linalg.norm(
         predicted, axis=1
     )
@@ -539,9 +542,9 @@ def estimate_leakage(standards: Sequence[MetalStandard]) -> Leakage:
 def estimate_axial_ratio(plate: MetalStandard, strips: MetalStandard) -> Leakage:
     """Estimate equal leakage of both boards (the authors' axial ratio) from the plate and strips in one orientation.
 
-    Raises DataError if the strips reflect s and p alike.
+    Raises DataError if the strips reflect s and p equally.
     """
-    # Relative to the plate (H, V) ~ (s + a p, p + a s).
+    # The pair relative to the plate is (H, V) ~ (s + a p, p + a s).
     h, v = (m / plate_value for m, plate_value in zip(strips.measured, plate.measured, strict=True))
     s, p = strips.wave
     # Strips must reflect s and p that differ by a tenth of their size (chosen), and the divisor must not vanish.

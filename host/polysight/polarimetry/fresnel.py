@@ -3,9 +3,9 @@
 Time convention `exp(+j omega t)`: a passive medium has permittivity `eps' - j eps''` with `eps'' >= 0`, and waves in it
 decay. Signs of Eq. 2 of the POLySIGHT paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
 
-The incidence angle of a pixel: a plane parallel to the stage reflects like a mirror: at every stage offset the
-reflection comes from the specular point, under the same angle. So all pixels have the incidence angle of the specular
-midpoint.
+The incidence angle of a pixel: a plane parallel to the stage reflects like a mirror. At every stage offset the
+reflection comes from the specular point, under the same angle, so that all pixels have the incidence angle of the
+specular midpoint.
 
 The image of a pixel also contains stage offsets within about one Fresnel zone of the specular one, with slightly
 different angles; near the border of the aperture only part of that zone was scanned. :func:`effective_incidence_map`
@@ -32,7 +32,7 @@ Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 _AIR = np.asarray(1.0 + 0j)
 _NAN = complex(np.nan, np.nan)
-# Replaces infinite permittivity in stacks: it reflects -1 within 1e-12.
+# Replaces an infinite permittivity in stacks: its reflection is -1 within 1e-12.
 _CONDUCTOR = 1 - 1e24j
 
 Incidence = Literal["one", "pixel"]
@@ -42,15 +42,15 @@ Incidence = Literal["one", "pixel"]
 def _compute_normal_wavenumber(eps: Complex, sine: Real) -> Complex:
     """Return index times cosine in the medium, sqrt(eps - sin^2 theta_i), the root that decays (Im <= 0)."""
     q: Complex = np.sqrt(eps - sine**2)
-    # NumPy's root has a positive real part, and so Im <= 0 for a lossy medium. Only in total reflection is the real
-    # part 0, and the sign of the imaginary part that of a rounding error or of a zero.
+    # NumPy's root has a positive real part, and so Im <= 0 for a lossy medium. Only in total reflection the real part
+    # is 0; the sign of the imaginary part then comes from a rounding error or from the sign of a zero.
     return np.where((q.real == 0) & (q.imag > 0), -q, q)
 
 
 def _broadcast_media(
     eps: npt.ArrayLike, theta_rad: npt.ArrayLike
 ) -> tuple[Complex, Real, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Broadcast permittivity and angle; return them made finite, and masks of metal (infinite) and of NaN."""
+    """Broadcast permittivity and angle; return them with finite placeholders, and masks of metal (infinite) and NaN."""
     eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
     # `isnan` of a complex number is true if either part is.
     unknown = np.isnan(eps) | ~np.isfinite(theta)
@@ -79,7 +79,7 @@ def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Comp
     s = np.sin(theta)
     q = _compute_normal_wavenumber(eps, s)
     r_s = np.where(metal, -1.0, (c - q) / (c + q))
-    # cos(theta_t) = q / n, so n_i cos(theta_t) -+ n_t cos(theta_i) is (q -+ eps c) / n: no square root of eps needed.
+    # cos(theta_t) = q / n, so that n_i cos(theta_t) -+ n_t cos(theta_i) is (q -+ eps c) / n: the n cancels.
     r_p = np.where(metal, -1.0, (q - eps * c) / (q + eps * c))
     return np.where(unknown, _NAN, r_s)[()], np.where(unknown, _NAN, r_p)[()]
 
@@ -121,7 +121,7 @@ def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Compl
         complex128; NaN where `p` is NaN.
     """
     p, theta = np.broadcast_arrays(np.asarray(p, np.complex128), np.asarray(theta_rad, np.float64))
-    # Use P or 1/P, whichever has modulus <= 1: no overflow near the Brewster angle.
+    # P or 1/P is used, whichever has a magnitude <= 1: no overflow near the Brewster angle.
     is_large = np.abs(p) > 1
     with np.errstate(invalid="ignore"):
         inverse = 1.0 / np.where(is_large, p, 1.0)
@@ -219,9 +219,9 @@ def multilayer(
     theta = np.asarray(theta_rad, np.float64)
     s = np.sin(theta)
     k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
-    # In each medium `q` is the normal wavenumber over k0, the admittance of a wave of polarisation s, and y = q / eps
-    # the impedance of one of polarisation p. A change of q or y at an interface reflects (q1 - q2) / (q1 + q2); for p
-    # the difference is taken the other way round, which gives the sign of Eq. 2.
+    # In each medium, q is the normal wavenumber over k0: the admittance of an s-polarised wave. y = q / eps is the
+    # impedance of a p-polarised wave. An interface reflects (q1 - q2) / (q1 + q2) of s and, with the sign of Eq. 2,
+    # (y2 - y1) / (y2 + y1) of p.
     q = [np.cos(theta).astype(np.complex128), *(_compute_normal_wavenumber(e, s) for e in media[1:])]
     y = [qi / ei for qi, ei in zip(q, media, strict=True)]
     r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
@@ -262,9 +262,10 @@ def specular_incidence_rad(rig: Instrument) -> float:
 def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Real:
     """Return the incidence angle of each pixel, averaged over the scanned stage offsets; radians, float64 [ny, nx].
 
-    The weight of offset u for a pixel is exp(-(k D)^2 / 8), where k D is the phase of the path at u minus that of the
-    specular path: a Gaussian of 2 rad (chosen), 1 at the specular offset, about 0.3 at the edge of the first Fresnel
-    zone (k D = pi). H and V are averaged. Pixels with less than a thousandth of the full weight get the specular angle.
+    The weight of the offset u for a pixel is exp(-(k D)^2 / 8), with k D the phase of the path at u minus that of the
+    specular path: a Gaussian with the standard deviation 2 rad (chosen). It is 1 at the specular offset, and about 0.3
+    at the edge of the first Fresnel zone (k D = pi). H and V are averaged. Pixels with less than a thousandth of the
+    full weight get the specular angle.
 
     Parameters
     ----------
@@ -278,10 +279,10 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     step = np.array([rig.grid.step_x_mm, rig.grid.step_y_mm]) / 1e3
     count = np.array([rig.grid.columns, rig.grid.rows])
     wavelength = SPEED_OF_LIGHT_M_S / (rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2)
-    # The stage offsets that count for a pixel are found by convolving the scanned grid with the weight around a point.
-    # The first Fresnel zone is longest along x, the plane of incidence. Two paths of length z / cos, over which a shift
-    # by u changes the sum by u^2 cos^3 / z, differ by half a wavelength at u = sqrt(lambda z / (2 cos^3)). Sum twice as
-    # far.
+    # The weights of a pixel's scanned offsets are summed by a convolution of the grid of offsets with the weight around
+    # a point, up to twice the first Fresnel zone. That is longest along x, the plane of incidence: over both legs, of
+    # the length z / cos, a shift by u changes the path by u^2 cos^3 / z, which is half a wavelength at
+    # u = sqrt(lambda z / (2 cos^3)).
     distance_m = rig.geometry.object_distance_mm / 1e3
     zone = np.sqrt(wavelength * distance_m / 2 / np.cos(specular_incidence_rad(rig)) ** 3)
     reach = np.ceil(2 * zone / step).astype(int)
@@ -299,9 +300,9 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
         deviation_sum = _convolve(visited, weight * (angle - specular))
         weight_sum = _convolve(visited, weight)
-        # In a full convolution an index is the sum of an index of either array. Here a pixel lies at a stage offset
-        # plus a displacement from the midpoint: the offset 0 has index (count - 1) / 2 in the grid, the displacement 0
-        # has index `reach` among the weights.
+        # In a full convolution, an index is the sum of the indices in both arrays. A pixel is at a stage offset plus a
+        # displacement from the midpoint: the offset 0 has the index (count - 1) / 2 in the grid, the displacement 0 has
+        # the index `reach` among the weights.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
         grid = np.meshgrid(row, column, indexing="ij")
@@ -376,9 +377,9 @@ def incidence_choice(
 def incidence_on_planes(angle_rad: Real, raised_m: Real | None, rig: Instrument) -> Real:
     """Return the angles [ny, nx] on planes that lie `raised_m` [ny, nx] behind the rig's object plane; None: on it.
 
-    Positive values are farther from the antennas. An antenna at the distance z from the object plane sees a place of it
-    at a sideways distance of z tan(angle). A plane behind has the same sideways distance and another z. z is the rig's
-    `object_distance_mm` for all antennas, from which theirs hardly differ.
+    Positive values are farther from the antennas. With the distance z of the plane, the antennas see a place at the
+    lateral distance z tan(angle). The lateral distance on a plane behind is the same: angle' = arctan(z tan(angle) /
+    (z + raised)). z is the rig's `object_distance_mm`, nearly the distance of each antenna.
     """
     if raised_m is None:
         return angle_rad

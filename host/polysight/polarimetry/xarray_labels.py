@@ -1,6 +1,7 @@
-"""`fresnel`, `permittivity_from_ratio`, `multilayer` for users' programs: they keep xarray's labels, refuse degrees.
+"""The public versions of `fresnel`, `permittivity_from_ratio` and `multilayer`, for users' programs.
 
-The package itself uses the plain functions of `fresnel.py`.
+They add two things to the plain functions of `fresnel.py`, which the package itself uses: results of xarray's labelled
+arrays are labelled, too, and an angle that is probably in degrees raises an error.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ class _Fresnel(Protocol):
 
 
 class _PermittivityFromRatio(Protocol):
-    """Type of :func:`permittivity_from_ratio`: a labelled array if one of the arguments is labelled."""
+    """Type of :func:`permittivity_from_ratio`: a labelled array if one of the arguments is labelled.
+
+    `p` is the polarisation ratio r_s / r_p.
+    """
 
     @overload
     def __call__(self, p: DataArray, theta_rad: Plain | DataArray) -> DataArray: ...
@@ -53,9 +57,10 @@ class _PermittivityFromRatio(Protocol):
 
 
 class _Multilayer(Protocol):
-    """Type of :func:`multilayer`: labelled arrays if an argument, or all media of a list, are labelled.
+    """Type of :func:`multilayer`: labelled arrays if an argument is labelled, or is a list of labelled arrays.
 
-    One labelled array in a list is enough when it runs; its type is the same as that of a list without one.
+    The function also returns labelled arrays for a list of labelled and plain entries. The type of such a list cannot
+    be distinguished from that of a list of plain entries, so that its result is typed as plain.
     """
 
     @overload
@@ -89,17 +94,17 @@ class _Multilayer(Protocol):
 
 
 def keep_labels(*results: str) -> Callable[[Function], Function]:
-    """Decorate a function of arrays that broadcast: with a `DataArray` among its arguments it returns such arrays.
+    """Decorate a function of arrays that broadcast: with a `DataArray` among its arguments it returns `DataArray`s.
 
-    `results` are the long names of what it returns. An argument may be a list of arrays. Dimensions broadcast by name;
-    coordinates that arrays share must be equal, else xarray raises a ValueError. Attributes are those of the first
-    `DataArray`, with the result's own unit (1) and long name.
+    `results` are the long names of the returned arrays. An argument may be a list of arrays. Dimensions broadcast by
+    name; coordinates that arrays share must be equal, otherwise xarray raises a ValueError. Attributes are those of the
+    first `DataArray`, with the result's own unit (1) and long name.
     """
 
     def decorate(function: Function) -> Function:
         @wraps(function)
         def call(*arguments: Any, **named: Any) -> Any:
-            # A DataArray can only be there if xarray was imported.
+            # Without an imported xarray no argument can be a DataArray.
             xarray = sys.modules.get("xarray")
             if xarray is None:
                 return function(*arguments, **named)
@@ -108,7 +113,7 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
             if not any(isinstance(entry, xarray.DataArray) for entry in entries):
                 return function(*arguments, **named)
 
-            # xarray passes all arrays as one flat list; this puts them back into the arguments.
+            # xarray passes all arrays as one flat list; `compute` puts them back into the arguments.
             def compute(*arrays: Any) -> Any:
                 remaining = iter(arrays)
                 filled = [_fill(value, remaining) for value in values]
@@ -165,7 +170,7 @@ fresnel: _Fresnel = cast(_Fresnel, _refuse_degrees(keep_labels(*_REFLECTION)(pla
 
 
 def _take_arrays_as_one_medium(function: Function) -> Function:
-    """Decorate `multilayer`: a `DataArray` is one medium, its dimensions are not media."""
+    """Decorate `multilayer`, which takes the first axis of an array as its media: a `DataArray` is a single medium."""
 
     @wraps(function)
     def call(eps: Any, thickness_m: Any, frequency_hz: Any, theta_rad: Any) -> Any:

@@ -4,9 +4,9 @@
 synchronisation does not remove (leakage, gains, noise, the direct path, backlash) to the averaged samples: hundreds of
 scenes take the time of one raw scan.
 
-Compared with a raw scan that the host synchronised (tests/simulators/test_cubes.py), a synced cube differs by one
-complex factor, common to all rows, channels and samples, and by less than 1 % RMS without noise, due to residuals of
-motion within a burst, of the filter, and of the object in the host's direct path. The noise power agrees within 5 %.
+A synced cube differs from a raw scan that the host synchronised (tests/simulators/test_cubes.py) by one complex factor,
+common to all rows, channels and samples. The remaining difference without noise is less than 1 % RMS, due to residuals
+of motion within a burst, of the filter, and of the object in the host's direct path. The noise power agrees within 5 %.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,9 @@ from polysight_simulators.scene.scene_file import Scene, apply_scene, stream_key
 def reference_cube(rig: Instrument, scene: Scene) -> dict[str, NDArray[np.complex64]]:
     """Return the object's echo after ideal synchronisation, at the true positions.
 
-    All disturbances of the scene are ignored: no leakage, gains, noise or direct path. Each position is the mean of its
-    burst (x + direction x mean travel). Each RX is referenced to its own direct path: phase 2 pi f (tau - tau_direct).
+    All disturbances of the scene are ignored: there are no leakage, gains, noise or direct path. Each position is the
+    mean of its burst (x + direction x mean travel). Phases are relative to each RX's own direct path, 2 pi f (tau -
+    tau_direct).
 
     Parameters
     ----------
@@ -60,11 +61,11 @@ def synced_cube(
     direct: bool = True,
     seed: int | None = None,
 ) -> NDArray[np.complex64]:
-    """Return the samples of a scan after ideal synchronisation: referenced to the direct path, bursts averaged.
+    """Return the samples of a scan after ideal synchronisation: relative to the direct path, bursts averaged.
 
-    Simulated: leakage, gains and phases of the channels, H over V and its drift, noise, loss of the direct path,
-    backlash; nothing else. An echo of amplitude A whose path exceeds the direct one by d is A exp(+j 2 pi f d / c), the
-    direct path is constant.
+    These disturbances are simulated: leakage, gains and phases of the channels, H over V and its drift, noise, loss of
+    the direct path, and backlash. An echo of amplitude A whose path exceeds the direct one by d is
+    A exp(+j 2 pi f d / c); the direct path is constant over f.
 
     Parameters
     ----------
@@ -116,7 +117,7 @@ def synced_cube(
 
 
 def _draw_noise(shape: tuple[int, ...], rms_of_channel: Real, key: int) -> NDArray[np.complex64]:
-    """Return the complex noise of `shape`, whose first axis are the channels."""
+    """Return complex noise of `shape`; its first axis is that of `rms_of_channel`."""
     rng = np.random.default_rng(key)
     noise = rng.standard_normal((*shape[:-1], 2 * shape[-1]), dtype=np.float32).view(np.complex64)
     return noise * (np.sqrt(0.5) * rms_of_channel).astype(np.float32)[:, None, None, None]
@@ -136,7 +137,7 @@ def _compute_drift(rig: Instrument, scene: Scene, board: Board) -> NDArray[np.co
 
 
 def _compute_burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:
-    """Return the RMS noise of an averaged sample; compensating the high-pass filter divides by its gain at the IF.
+    """Return the RMS noise of an averaged sample, divided by the gain of the high-pass filter, which is compensated.
 
     `echo_m` is the path from TX over the object to RX.
     """
@@ -147,7 +148,7 @@ def _compute_burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int,
     averaged = 10.0 ** (-d.direct_snr_db / 20) / np.sqrt(rig.burst.chirps_a_position)
     if not d.hpf:
         return float(averaged)
-    # The IF is that half way between direct path and echo.
+    # The filter's gain is that at the IF half way between direct path and echo.
     delay_s = (antennas(rig, board).direct_m[0] + echo_m) / 2 / SPEED_OF_LIGHT_M_S
     if_hz = chirp.slope_hz_per_s * delay_s + power_on(rig, scene, board, seed).if_error_hz.mean()
     # The first value is the filter, the second its derivative.
@@ -164,8 +165,8 @@ def _sample_field(
 ) -> NDArray[np.complex64]:
     """Return the field at the true positions, [rx, row, column, frequency], with the phase of path `path_m_of_rx` [rx].
 
-    That is the field's `centre_path_m`, whose phase it lacks, less a direct path from which phases count. Complex
-    `gains` [rx] multiply the samples; in rows towards -x the stage lags behind by `backlash_mm`.
+    This path is the field's `centre_path_m`, whose phase was removed, less the direct path. Complex `gains` [rx]
+    multiply the samples; in rows towards -x the stage lags behind by `backlash_mm`.
     """
     if np.array_equal(field.nodes_hz, f):
         nodes_to_frequencies = np.eye(len(f))

@@ -1,25 +1,29 @@
 """Object field: the object's echo at every stage position, computed fast and cached.
 
-TX and RX move together in a plane, so the echo depends only on the difference of plate and stage position:
-field(u) = integral A(v) g(v - u) dv, a convolution of the reflecting amplitude A of the scene. It is computed in the
-spectral domain:
+TX and RX move together in a plane, so that the echo at the stage offset u is a convolution of the reflecting amplitude
+A of the scene with a kernel g of the lag w = v - u:
+
+    field(u) = integral A(v) g(v - u) dv,     g(w) = obliquity exp(j k path(w)) / (r1 r2)
+
+It is computed as a product of spectra:
 
 * plates and points enter by their analytic Fourier transforms, so edges are exact at any position;
-* the kernel g is sampled finely enough for its phase gradient (per axis) and fades out beyond the scene;
+* the kernel is sampled finely enough for its phase gradient (per axis) and fades out beyond the scene;
 * r(theta) of each plate is a short Chebyshev series in the local angle, with one kernel per order;
-* only a few Chebyshev nodes of the IF band are computed, with the centre delay removed; the rest is interpolated;
+* only a few frequencies, the Chebyshev *nodes* of the IF band, are computed, without the phase of a centre path; the
+  other frequencies are interpolated;
 * the result is oversampled, and evaluated at any stage position with a windowed sinc.
 
 Plates and points of similar height share a kernel, computed at that height (a :class:`_Level`). The remaining height z
 of a point, from tilt, roughness and height of its plate, adds C z to the path, with C = dpath/dz of about 2 cos(theta).
-exp(j k C z) does not separate into plate and kernel, for C varies over the kernel, but its interpolation between a few
-values C_m does:
+C varies over the kernel, so that exp(j k C z) is not a product of a factor of the kernel and a factor of the plate. Its
+interpolation between a few values C_m is a sum of such products:
 
     exp(j k C z) = sum over m of l_m(C) exp(j k C_m z).
 
-l_m belongs to the kernel and exp(j k C_m z) to the plate: a tilt shifts the spectrum of its rectangle, the height of a
-facet changes its phase. Neglected are the change of C over z (except for its mean over the plate's height), the changes
-of spreading and angle, and the rotation of the plate's normal in the obliquity.
+l_m(C) belongs to the kernel and exp(j k C_m z) to the plate: a tilt shifts the spectrum of its rectangle, the height of
+a facet changes its phase. Neglected are the change of C over z (except for its mean over the plate's height), the
+changes of spreading and angle, and the rotation of the plate's normal in the obliquity.
 """
 
 from __future__ import annotations
@@ -46,10 +50,9 @@ from polysight_simulators.scene.scene_file import Facets, Scene, draw_specimens,
 from polysight_simulators.scene.shapes import shape_field
 from polysight_simulators.scene.spectral_grid import OVERSAMPLING, TAPS, Axis, oversample, spectral_axes
 
-# Errors relative to an echo, chosen: smaller ones take more kernels, that is more transforms.
-# Of the Chebyshev series in the local angle.
+# Largest errors relative to an echo, of the Chebyshev series in the local angle and of the interpolation in dpath/dz.
+# Chosen: smaller ones take more kernels, that is more transforms.
 _ANGLE_TOLERANCE = 1e-4
-# Error of the interpolation in dpath/dz; chosen.
 _RELIEF_TOLERANCE = 2e-4
 # Range of heights that share a kernel. Chosen: a wider one takes fewer levels, each with more nodes of dpath/dz.
 _LEVEL_MM = 2.0
@@ -78,7 +81,7 @@ def _fit_angle_series(
     rows = [[reflect(p, f, centre + half * x) for f in nodes_hz] for p in scene.plates]
     values = np.array(rows, dtype=np.complex128)
     series = np.einsum("pfm,jm->pfj", values.reshape(len(scene.plates), len(nodes_hz), node_count), values_to_series)
-    # Largest sum of all coefficients from each order on.
+    # Sum of the largest coefficients from each order on: a bound of the error without these orders.
     tail = np.cumsum(np.abs(series).max(axis=(0, 1), initial=0.0)[::-1])[::-1]
     orders = max(1, int(np.sum(tail > _ANGLE_TOLERANCE)))
     return series[:, :, :orders]
@@ -93,13 +96,13 @@ def _transform_intervals(
     """
     k = axis.kappa
     width = np.where(sizes > 0, sizes, 1.0)[:, None]
-    # The inverse transform begins at the first offset, the kernel at its first place.
+    # The output of the inverse transform begins at `first_u`, and the kernel at `w[0]`.
     shift = axis.w[0] + axis.first_u - centres
     envelope = width * np.sinc((np.outer(sizes, k) - (sizes * shifts)[:, None]) / (2 * np.pi))
     return envelope.astype(np.complex128) * np.exp(1j * np.outer(shift, k))
 
 
-# Products of matrices of at most this size (rows x terms x columns) stay in one thread with OpenBLAS: threads are slow
+# OpenBLAS computes products of matrices of at most this size (rows x terms x columns) in one thread: threads are slow
 # while other processes run.
 _PRODUCT_SIZE = 1 << 18
 
@@ -125,9 +128,9 @@ class _Level:
     Attributes
     ----------
     plates, points
-        Indices of the members.
+        Indices of the level's plates, and of its points.
     lift_m, point_lift_m
-        Their heights relative to the level.
+        Heights of these plates and points relative to the level.
     legs
         r1, r2, incidence and obliquity over the kernel at the level's height, for each RX.
     bend
@@ -155,12 +158,12 @@ class _Level:
             return None
         values_at_nodes = chebyshev.chebvander(cheb_nodes(n), n - 1) * (2.0 / n)
         values_at_nodes[:, 0] /= 2.0
-        # Without a slope dpath/dz is the sum of both cosines, twice the obliquity.
+        # On a level surface dpath/dz is the sum of both cosines, twice the obliquity.
         everywhere = chebyshev.chebvander((2 * oblique - self.middle) / self.half, n - 1)
         return [everywhere @ row for row in values_at_nodes]
 
     def lift_phase(self, lift_m: optics.Real, wave: float, m: int) -> optics.Complex | float:
-        """Return the phase factors of heights relative to the level, with the mean change of dpath/dz."""
+        """Return exp(j k (C_m z + bend z^2 / 2)) for heights z relative to the level; `wave` is k."""
         if not lift_m.any():
             return 1.0
         return np.exp(1j * wave * (self.steepness[m] * lift_m + 0.5 * self.bend * lift_m**2))
@@ -168,7 +171,7 @@ class _Level:
 
 @dataclass(frozen=True)
 class _Plane:
-    """Plates and points that are computed on one grid: all of a scene, or those in the background or before it.
+    """Plates and points that are computed on one grid: all of a scene, only its background, or all but its background.
 
     Attributes
     ----------
@@ -192,7 +195,7 @@ class _Plane:
     amplitudes: optics.Complex
 
     def levels(self, rx: Sequence[int], top_hz: float) -> list[_Level]:
-        """Group plates and points by height; at least one level, also for an empty scene.
+        """Group plates and points by height; returns at least one level, also for an empty scene.
 
         `rx`: channels; `top_hz`: the highest frequency.
         """
@@ -265,7 +268,7 @@ class _Plane:
         """Return pairs of a spectrum [kappa_y, kappa_x] and the series [order] of its kernel in the local angle.
 
         The plates' echo is the sum of spectrum times kernel over pairs; heights have the phases of C_m. There is a pair
-        for each order, or for each plate if there are fewer of them: as few as there can be kernels.
+        for each order, or for each plate if there are fewer plates than orders, so that there are few kernels.
         """
         if not level.plates:
             return []
@@ -273,7 +276,7 @@ class _Plane:
         ant = self.ant
         plates = [self.scene.plates[i] for i in level.plates]
         table = np.array([(*p.centre_mm, *p.size_mm) for p in plates]) / 1e3
-        # Phase by which a tilted plate turns along x and y, rad/m.
+        # Growth of a tilted plate's phase along x and y, rad/m, [plate, 2].
         turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
         weights = series[level.plates] * optics.plate_scale(ant, self.scene, f)
         weights = weights * np.reshape(level.lift_phase(level.lift_m, wave, m), (-1, 1))
@@ -286,8 +289,8 @@ class _Plane:
         x = np.concatenate([plate_points for _, plate_points in strips])
         strips_of_plate = [len(plate_points) for plate_points, _ in strips]
         orders = weights.shape[1]
-        # A plate's echo is a sum over orders. Either each plate has a kernel, which holds the sum, or each order has
-        # one, which plates share by their weights.
+        # A plate's echo is a sum over orders. Either each plate has a kernel, which is the sum over its orders, or each
+        # order has a kernel for all plates, whose spectra are summed with their weights.
         if len(plates) < orders:
             shares = np.eye(len(plates), dtype=np.complex128)
             kernel_series = weights
@@ -302,8 +305,8 @@ class _Plane:
     ) -> tuple[optics.Complex, NDArray[np.complex64]]:
         """Return the spectra of the rows of facets of a plate along y and x, [row, kappa_y] and [row, kappa_x].
 
-        The plate's spectrum is the sum of their outer products. `turn` is the phase of its tilt in rad/m, `per_metre`
-        that of height.
+        The plate's spectrum is the sum of their outer products over the rows. `turn` [2] is the growth of its phase
+        along x and y by its tilt, rad/m, and `per_metre` that with height.
         """
         x = _transform_intervals(
             self.x, self.ant.centre_m[0] + centre_m[0] + parts.x_m, np.full(parts.x_m.shape, parts.size_m[0]), turn[0]
@@ -339,9 +342,8 @@ def compute(
     planes = _group_planes(rig, scene, board, top_hz)
     levels = [(plane, level) for plane in planes for level in plane.levels(rx, top_hz)]
     nodes_hz, centre = _choose_nodes(scene, levels, samples_hz)
-    # Range of the local angle over all levels and channels.
+    # Range of the local angle, the third of `legs`, over all levels and channels.
     legs = [leg for _, level in levels for leg in level.legs]
-    # `legs` has the incidence as its third.
     low = min(leg[2].min() for leg in legs)
     high = max(leg[2].max() for leg in legs)
     reflect = optics.board_reflectivity(board, scene)
@@ -374,7 +376,7 @@ def compute(
 
 
 def _group_planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[_Plane]:
-    """Return the scene's parts: a wide background has a grid of its own, so that small plates keep small kernels.
+    """Return the scene's parts: a wide background has a grid of its own, so that kernels of small plates are small.
 
     All parts have the same step and the same range of offsets, so that their fields add up.
     """
@@ -398,11 +400,8 @@ def _group_planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) ->
             shapes=scene.shapes if is_first else (),
         )
         x, y = spectral_axes(rig, part, ant, top_hz)
-        if is_first:
-            own_amplitudes = amplitudes
-        else:
-            own_amplitudes = amplitudes[:0]
-        planes.append(_Plane(ant, part, x, y, tuple(surfaces[i] for i in members), own_amplitudes))
+        point_amplitudes = amplitudes if is_first else amplitudes[:0]
+        planes.append(_Plane(ant, part, x, y, tuple(surfaces[i] for i in members), point_amplitudes))
     step_x = min(plane.x.step for plane in planes)
     step_y = min(plane.y.step for plane in planes)
     return [replace(p, x=replace(p.x, step=step_x), y=replace(p.y, step=step_y)) for p in planes]
@@ -427,8 +426,7 @@ def _choose_nodes(
         margin_m = max(margin_m, 4 * depth)
     # Shapes extend beyond their fronts' heights; some 0.15 m on either side hold their specular points.
     depth_m = max((abs(plate.height_mm) / 1e3 + 0.15 for plate in scene.shapes), default=0.0)
-    # Both ends are extended equally, so that the spread is even about the centre: by `margin_m`, and by twice each
-    # depth.
+    # Both ends are extended equally, by `margin_m` and by twice `depth_m`: the range is symmetric about `centre`.
     spread = longest_m - shortest_m + 2 * margin_m + 4 * depth_m
     centre = (longest_m + shortest_m) / 2
     # Time-bandwidth product plus a few: interpolation error of the Chebyshev series below 1e-6.
@@ -463,7 +461,7 @@ class _Kernels:
     def prepare(
         cls, plane: _Plane, level: _Level, theta: tuple[float, float], orders: int, centre_m: float
     ) -> _Kernels:
-        """Return a level's factors.
+        """Return the kernels' properties of a level.
 
         `theta`: range of angles of the whole scene (rad), over which there are `orders` Chebyshev polynomials.
         `centre_m`: path whose phase is removed.
@@ -478,7 +476,7 @@ class _Kernels:
             shares = level.shares(oblique)
             paths_m.append(r1 + r2 - centre_m)
             spreading.append([(faded * share).astype(np.float32) for share in shares or [1.0]])
-            # The range of angles is -1 to 1 for the polynomials.
+            # The polynomials take the range of angles as -1 to 1.
             scaled_angle = (incidence - (low + high) / 2) / max((high - low) / 2, 1e-9)
             polynomials = chebyshev.chebvander(scaled_angle, orders - 1)
             angle.append(np.moveaxis(oblique[..., None] * polynomials, -1, 0).astype(np.float32))
@@ -501,7 +499,7 @@ class _Kernels:
 def _add_orders(
     series: optics.Complex, polynomials: NDArray[np.float32]
 ) -> NDArray[np.complex64] | NDArray[np.float32]:
-    """Return the sum of a series over polynomials [order, y, x]; without BLAS threads."""
+    """Return the sum of series [order] times polynomials [order, y, x]; einsum starts no BLAS threads."""
     (used_orders,) = np.nonzero(series)
     if len(used_orders) == 1 and series[used_orders[0]] == 1:
         return polynomials[used_orders[0]]
@@ -512,7 +510,7 @@ def _add_orders(
 
 
 def _compute_phasors(cycles: optics.Real) -> NDArray[np.complex64]:
-    """Return exp(2 pi j cycles): the fraction of a cycle, which single precision holds to 4e-7 rad, is left."""
+    """Return exp(2 pi j cycles); whole cycles are removed first, so that single precision has errors of 4e-7 rad."""
     phase = (2 * np.pi * (cycles - np.rint(cycles))).astype(np.float32)
     phasors = np.empty(phase.shape, np.complex64)
     np.cos(phase, out=phasors.real)
@@ -575,7 +573,7 @@ class ObjectField:
         return out
 
     def covers(self, x_m: optics.Real, y_m: optics.Real) -> NDArray[np.bool_]:
-        """True for offsets inside the field's aperture, bool [n]."""
+        """Return True for offsets inside the field's aperture, bool [n]."""
         is_covered = np.ones(len(x_m), dtype=np.bool_)
         for axis, u in enumerate((x_m, y_m)):
             low, high = self._reach(axis)

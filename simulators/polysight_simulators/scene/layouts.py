@@ -1,7 +1,8 @@
-"""Write simulated scans: as scan folders, and in the layouts of the published data set.
+"""Write simulated scans: as scan folders, and in the two layouts of the published data set.
 
-The latter are `unsynced/<scan>` folders and `raw/` cubes, simulated echoes after ideal synchronisation. Byte formats
-follow docs/spec/scan-folder.md and the description of the data set, implemented here independently of the host.
+The published layouts are `unsynced/<scan>` folders of raw data, and `raw/` cubes, which are echoes after ideal
+synchronisation. Byte formats follow docs/spec/scan-folder.md and the description of the data set; they are implemented
+here independently of the host.
 """
 
 import json
@@ -29,7 +30,7 @@ from polysight_simulators.scene.optics import antennas, direct_factor
 from polysight_simulators.scene.radar import sample_frequencies_hz
 from polysight_simulators.scene.scene_file import Scene, apply_scene
 
-# Lost bytes of a row's payload, each from the first to the one after the last.
+# Ranges of lost bytes in a row's payload: the first byte of each, and the one after its last.
 Gaps = list[tuple[int, int]]
 # Sequence number and byte count, before each payload.
 _HEADER_BYTES = 10
@@ -360,9 +361,9 @@ class AuthorsLayout:
     def _format_packet_log(self, size: int, lost_ranges: Gaps, points: list[int], step_s: float) -> str:
         """Return a line for each packet received: sequence number, payload bytes, Unix time.
 
-        `size`: bytes sent; `lost_ranges`: ranges of them; `points`: numbers of the points sent; `step_s`: time between
-        points. The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs
-        that.
+        `size`: number of bytes sent; `lost_ranges`: lost ranges of these; `points`: numbers of the points sent;
+        `step_s`: time between points. The last, incomplete packet is late, because the card sends it after a timeout;
+        the authors' decoder expects that.
         """
         full_bytes = packet_payload_bytes(self._rig)
         frame_bytes = self._rig.frame_bytes
@@ -376,7 +377,7 @@ class AuthorsLayout:
             if packet in lost_packets:
                 continue
             stop = min(start + full_bytes, size)
-            # The packet is received 0.2 ms (chosen) after the trigger of the chirp that its last byte is of.
+            # The packet is received 0.2 ms (chosen) after the trigger of the chirp that its last byte belongs to.
             position, chirp = divmod((stop - 1) // frame_bytes, pulses)
             received_s = self._now_s + points[position] * step_s + chirp * period_s + 2e-4
             if stop - start < full_bytes:
@@ -400,7 +401,7 @@ def _describe_collection(rig: Instrument, scan: str, zero_filling: bool, by_colu
     h, v = rig.receivers
     # The last shift of a mount is its board's origin; the one before it is the offset of the tilted board.
     tilt_offset_mm = [step.shift_mm for step in h.mount if step.shift_mm is not None][-2]
-    # V turns by its own angle first, then with H: the last turns are those of both.
+    # V's mount has a turn of its own first, and then the turns that it shares with H.
     return {
         "dx": rig.grid.step_x_mm,
         "dy": rig.grid.step_y_mm,
@@ -510,7 +511,7 @@ def write_cube(
         direct_m = antennas(rig, board).direct_m
         if keep_direct:
             cube += (direct_factor(board, scene) * direct_m[0] / direct_m).astype(np.complex64)[:, None, None, None]
-        # The cube is without the direct path of each RX; this part of that path is added again.
+        # Phases of the cube are relative to the direct path of each RX; `added_m` of that path is added again.
         if from_transmitter:
             added_m = direct_m
         elif common_reference:

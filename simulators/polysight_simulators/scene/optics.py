@@ -2,10 +2,11 @@
 
 Reflection at 76..81 GHz in both polarisations, implemented independently of the host. Media are eps' - j eps'' (time
 dependence exp(+j omega t)). Signs of Eq. 2 of the POLySIGHT paper: a perfect conductor has r_s = r_p = -1, so that
-P = r_s / r_p = 1. The echo is physical optics on flat plates, each with its own height and tilt.
+P = r_s / r_p = 1. The echo is computed by physical optics on flat plates, each with its own height and tilt.
 
-A receiver's samples are the conjugate of the wave: a delay is exp(-j 2 pi f tau) in the wave and +2 pi f tau in the
-samples. So complex factors of the wave (reflection, leakage) enter here as their conjugate, :func:`conjugate`.
+A receiver's samples are the conjugate of the wave: a delay tau is exp(-j 2 pi f tau) in the wave, and its conjugate
+exp(+j 2 pi f tau) in the samples. So complex factors of the wave (reflection, leakage) enter as their conjugate
+(:func:`conjugate`).
 
 Amplitudes are relative to the direct path: a free path of length R has amplitude d / R, d the board's direct path to
 RX1. Antenna patterns are modelled only by one constant, the scene's `object_gain`.
@@ -87,7 +88,7 @@ def reflect_layers(
     media = [(x.epsilon, x.thickness_mm) for x in layers]
     if media[-1][1] is not None:
         media.append((1.0 + 0j, None))
-    # Impedance of the layers behind this one, for both polarisations. The last layer has none behind it.
+    # Impedance of the layers behind the current one, for both polarisations; not used by the last medium.
     z_s: Complex = np.zeros(theta.shape, np.complex128)
     z_p: Complex = z_s
     for epsilon, thickness_mm in reversed(media):
@@ -108,8 +109,8 @@ def reflect_layers(
 def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Complex, Complex]:
     """Return the reflection of a screen that conducts in one direction only, at `psi_rad` from y towards x.
 
-    Strips turn the polarisation: what they return depends on s and p together. The coefficients are those of a wave
-    whose s and p are equal, as the transmitter sends it, and hold for no other.
+    Strips rotate the polarisation: each reflected component depends on both s and p of the incident wave. The
+    coefficients hold only for a wave whose s and p are equal, as the transmitter sends it.
     The current J along the strips u = (sin psi, cos psi) in (x, y) makes the total field along u zero. It radiates with
     the wave impedances of the polarisations, 1 / (2 cos) for s and cos / 2 for p in units of free space.
 
@@ -178,8 +179,8 @@ class Antennas:
         r2 = np.sqrt(bx**2 + by**2 + bz**2)
         theta = 0.5 * np.arccos(np.clip((ax * bx + ay * by + az * bz) / (r1 * r2), -1.0, 1.0))
         if any(slope):
-            # The component along the normal (-slope_x, -slope_y, 1). Its length is not made 1: it is the ratio of the
-            # surface's area to dx dy.
+            # The components along the normal (-slope_x, -slope_y, 1). Its length is the ratio of the surface's area to
+            # dx dy, and is therefore not normalised.
             az = az - slope[0] * ax - slope[1] * ay
             bz = bz - slope[0] * bx - slope[1] * by
         return r1, r2, theta, 0.5 * (az / r1 + bz / r2)
@@ -202,8 +203,8 @@ def conjugate(factor: Any) -> Any:
 def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
     """Return the function that gives a plate's reflection in a receiving board's samples, with cross-polar leakage.
 
-    H: s + leak_h p. V: p + leak_v s. TX is rotated by 45 degrees and sends both polarisations equally. s and p are what
-    a plate returns in the polarisations of H and V (:func:`turn_reflection`).
+    H: s + leak_h p. V: p + leak_v s. TX is rotated by 45 degrees and sends both polarisations equally. s and p are a
+    plate's reflection in the polarisations of H and V (:func:`turn_reflection`).
     """
     leak_h = complex(*scene.disturbances.leakage_h)
     leak_v = complex(*scene.disturbances.leakage_v)
@@ -223,10 +224,13 @@ def turn_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[Com
     """Return the reflection of a plate in the polarisations of H and V for a wave with equal s and p there.
 
     A plate whose height grows along y by w turns the plane of incidence about x. Its s axis then differs by the angle
-    d = w sin(theta) from that of a level plate, for the incident and for the reflected wave. To first order the
-    incident wave, which has 1 of s and 1 of p, has 1 - d and 1 + d about the turned axis; turning the reflected wave
-    back gives (1 - d) r_s - d r_p in H and (1 + d) r_p + d r_s in V. For metal this is the field of TX's mirror image,
-    whose polarisation is 2 (n . e) n - e for a polarisation e of TX and the normal n.
+    d = w sin(theta) from that of a level plate, for the incident and for the reflected wave. In the turned axes the
+    incident wave (s, p) = (1, 1) is (1 - d, 1 + d), to first order. The reflected wave, turned back, is
+
+        H: (1 - d) r_s - d r_p,    V: (1 + d) r_p + d r_s
+
+    For metal this is the field of TX's mirror image, whose polarisation is 2 (n . e) n - e for a polarisation e of TX
+    and the normal n.
     """
     r_s, r_p = plate_reflection(plate, frequency_hz, theta)
     d = slopes(plate)[1] * np.sin(theta)
@@ -234,7 +238,7 @@ def turn_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[Com
 
 
 def direct_factor(board: Board, scene: Scene) -> complex:
-    """Return the direct path in a board's samples: s and p are equal, so the wave is 1 + leakage."""
+    """Return the factor of the direct path in a board's samples: s and p are equal, so the wave is 1 + leakage."""
     d = scene.disturbances
     leakage = d.leakage_h if board.role == "receive_h" else d.leakage_v
     return conjugate(1.0 + complex(*leakage))
@@ -250,9 +254,9 @@ def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
 
 
 def point_scale(ant: Antennas) -> float:
-    """Return the factor with which a point of amplitude 1 at the specular midpoint equals the direct path.
+    """Return the factor of a point's 1 / (r1 r2), square metres.
 
-    It is that of a point's 1 / (r1 r2), square metres.
+    With it a point of amplitude 1 at the specular midpoint is as strong as the direct path.
     """
     r1, r2, _, _ = ant.legs(ant.centre_m[0], ant.centre_m[1], 0)
     return float(r1 * r2)
@@ -305,7 +309,7 @@ def field_exact(
         px, py = ant.centre_m[:2] + np.array(point.position_mm) / 1e3
         z = ant.plane_z_m + point.height_mm / 1e3
         r1, r2, _, _ = ant.legs(px - offsets_m[:, 0], py - offsets_m[:, 1], rx, z)
-        # A point returns s and p alike, as they come by the direct path, so that leakage has the same effect on both.
+        # A point reflects s and p equally, as the direct path transmits them: leakage has the same effect on both.
         amplitude = conjugate(complex(*point.amplitude)) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
         phase = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(r1 + r2, frequencies_hz))
         out += amplitude[:, None] * phase
@@ -314,9 +318,9 @@ def field_exact(
 
 def _place_quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
     """Return quadrature points x, y relative to the centre of a rectangle, and their areas; each [y, x]."""
-    # Over a side of length L the phase changes by 2 k L at most: exp(j k L u) for u = -1 to 1, whose series converges
-    # from the degree k L on. Gauss-Legendre with n points is exact up to the degree 2 n - 1, so that n = k L / 2
-    # suffices. Taken are 0.6 k L, and 16 points more.
+    # Over a side of length L the phase changes by at most 2 k L, as exp(j k L u) for u from -1 to 1. Its series
+    # converges from the degree k L on. Gauss-Legendre quadrature with n points is exact up to the degree 2 n - 1, so
+    # that n = k L / 2 is enough. 0.6 k L + 16 points are taken.
     wavenumber = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     width, height = size_m
     nodes_x, weights_x = np.polynomial.legendre.leggauss(int(wavenumber * width * 0.6) + 16)

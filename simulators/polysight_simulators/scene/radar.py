@@ -1,12 +1,12 @@
 """Simulated radars: frames of the three boards for given stage offsets.
 
-A chirp is the sum of direct path and object, times a factor per chirp, through the high-pass filter:
+The signal of a chirp is the sum of direct path and object, times a factor per chirp, through the high-pass filter H:
 
     s[n, k] = factor[n, k] (H(f_n,k) F[n, k] + H'(f_n,k) F1[n, k]) gain + noise
 
-for chirp n and sample k. F is the undisturbed signal, f_n,k the middle of its band shifted by that chirp's offset, and
-F1 = (dF/dt) / (2 pi j) - middle F. This is the filter's response to first order around the middle of a signal of about
-50 kHz bandwidth; the error is H'' df^2 / 2, below 1e-3 for the published offset of about 1 MHz.
+for chirp n and sample k. F is the undisturbed signal, f_n,k the middle of its IF band plus that chirp's frequency
+offset, and F1 = (dF/dt) / (2 pi j) - middle F. This is the filter's response to first order around the middle of a
+signal of about 50 kHz bandwidth; the error is H'' df^2 / 2, below 1e-3 for the published offset of about 1 MHz.
 
 The effects of a receiving board (:class:`Receiver`) are timing, crystal, chirp shape, filter and gains.
 :class:`PatternSource` gives frames with a counting pattern, for bit-exact tests.
@@ -119,8 +119,9 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     phase = 2 * np.pi * (constant * t + slope * t**2 / 2)
     error = constant + slope * t
 
-    # Ripple after the start of the ramp: a decaying oscillation of the IF. Bend before its end: a parabola. Boards have
-    # up to 30 and 20 % more or less of them, chosen. The phase is the integral of the frequency error.
+    # The IF has a ripple after the start of the ramp, a decaying oscillation, and a bend before the end of the ramp, a
+    # parabola. They differ from board to board by up to 30 % and 20 % (chosen). The phase is the integral of the
+    # frequency error.
     ramp_s = chirp.adc_start_us * 1e-6 + t
     decay_per_s = -1 / (d.ripple_us * 1e-6) + 2j * np.pi / _RIPPLE_PERIOD_S
     swing = d.ripple_hz * rng.uniform(0.7, 1.3) * np.exp(decay_per_s * ramp_s)
@@ -175,8 +176,8 @@ def compute_chirp_factors(
 _BATCH = 64
 # Largest count of the ADC's 16 bits.
 _FULL_SCALE = 32767
-# Delay from TX to RX on the transmit board, 6 cm, and the amplitude there, relative to the receivers' direct path. Both
-# are chosen: a short path is strong, and the filter weakens its low tone.
+# Leakage from TX to RX on the transmit board: its delay (6 cm), and its amplitude relative to the receivers' direct
+# path. Both are chosen: a short path is strong, and the filter weakens its low tone.
 _LEAKAGE_DELAY_S = 0.2e-9
 _LEAKAGE_AMPLITUDE = 2.0
 

@@ -1,8 +1,9 @@
 """Scene files (docs/spec/scene-file.md), the specimens drawn from them, and reproducible random numbers.
 
-Random numbers come from a seed and names: equal on every machine and in any order of calls. A scene file has nominal
-values; `draw_specimens` draws each plate's permittivity and adds shift and tilt of the object plane to it. The draws
-depend only on the scene's seed and the plate's index: another power cycle (`--seed`) scans the same specimens.
+Random numbers follow from a seed and names: they are equal on every machine and in any order of calls. A scene file has
+nominal values; `draw_specimens` draws each plate's permittivity around its nominal value, and adds shift and tilt of
+the object plane to the plates. The draws depend only on the scene's seed and the plate's index: another power cycle
+(`--seed`) scans the same specimens.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def _tabulate_normal() -> NDArray[np.float32]:
     return (middles / middles.std()).astype(np.float32)
 
 
-# Every number has both limits: they also refuse NaN and infinities, and keep a scan's size in proportion. Chosen, wide
-# enough for any scene that makes sense.
+# Every number has both limits: they also refuse NaN and infinities, and limit the size of a scan. They are chosen, wide
+# enough for any reasonable scene.
 Seed = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Millimetres = Annotated[float, msgspec.Meta(ge=-2000, le=2000)]
 Size = Annotated[float, msgspec.Meta(ge=0.01, le=2000)]
@@ -105,7 +106,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _require(ok: bool, rule: str) -> None:
-    """Raise ValueError with this rule unless `ok`; the reader of the file makes it a ConfigError."""
+    """Raise ValueError with this rule unless `ok`; `decode` turns it into a ConfigError."""
     if not ok:
         raise ValueError(rule)
 
@@ -301,8 +302,8 @@ class Disturbances(_Table, frozen=True):
     rx_gain_spread_db: GainSpread = 1.0
     rx_phase_spread_deg: Annotated[float, msgspec.Meta(ge=0, le=360)] = 20.0
     hv_gain_db: Gain = 1.5
-    # Growth of V's echo against H's from the first to the last position: a share, and degrees. The direct path does not
-    # have it, so that referencing to that path does not take it away.
+    # Change of V's echo relative to H's from the first to the last position: relative amplitude, and degrees. The
+    # direct path does not have it, so that the division by that path does not remove it.
     hv_drift: tuple[Drift, Angle] = (0.0, 0.0)
     # Share (real, imaginary) of the other polarisation that a board receives too.
     leakage_h: Leakage = (0.05, 0.0)
@@ -315,7 +316,7 @@ class Disturbances(_Table, frozen=True):
     adc_full_scale: Factor = 64.0
     # Probability that a packet is lost.
     packet_loss: Share = 0.0
-    # Rows towards -x are shifted so far along +x.
+    # Rows towards -x are shifted along +x by this much.
     backlash_mm: Height = 0.0
     sync_skew_ns: Skews = Skews()
     # Attenuation of the direct path alone.
@@ -430,7 +431,7 @@ def _apply_switches(table: Any, source: str) -> Any:
                 )
             result[key] = SWITCHED_OFF.get(key, value)
         elif value == "on" or value is True:
-            # Its default. An unknown key stays: the caller's `decode` refuses it.
+            # Without the key its default applies. An unknown key is kept: the caller's `decode` refuses it.
             result.pop(key, None)
             if key not in Disturbances.__struct_fields__:
                 result[key] = value
@@ -525,11 +526,11 @@ class Facets:
 
 
 def draw_specimens(scene: Scene) -> Scene:
-    """Return the scene with plates and points as they truly are; applying it again changes nothing.
+    """Return the scene with the true properties of plates and points; applying this again changes nothing.
 
-    Permittivities are drawn with `specimen_spread`: the real part from a normal distribution (at least 1), the loss
-    from a log-normal one, around the nominal values; a layer of air stays air. Shift and tilt of the plane are added to
-    those of each plate and point.
+    Permittivities are drawn with `specimen_spread` around the nominal values: the real part from a normal distribution
+    (at least 1), the loss from a log-normal one; a layer of air is not changed. Shift and tilt of the plane are added
+    to those of each plate and point.
     """
     plates = tuple(_move_with_plane(_draw_permittivities(p, i, scene), scene) for i, p in enumerate(scene.plates))
     points = tuple(
@@ -567,7 +568,7 @@ def slopes(plate: Plate) -> tuple[float, float]:
 
 
 def _find_plane_height_mm(scene: Scene, at_mm: Pair) -> float:
-    """Return how far the shifted and tilted plane lies beyond the nominal one at a place."""
+    """Return the distance of the shifted and tilted plane behind the nominal one at a place."""
     heights_mm = [math.tan(math.radians(a)) * x for a, x in zip(scene.plane_tilt_deg, at_mm, strict=True)]
     return scene.plane_shift_mm + sum(heights_mm)
 
@@ -596,7 +597,7 @@ def _draw_permittivities(plate: Plate, index: int, scene: Scene) -> Plate:
 
 
 def _vary_layer(layer: Layer, scene: Scene, rng: np.random.Generator) -> Layer:
-    """Return the layer with a drawn permittivity. Air stays air, but takes its numbers of the generator too."""
+    """Return the layer with a drawn permittivity. Air is not changed, but numbers are drawn for it, too."""
     varied = _vary(layer.permittivity, scene.specimen_spread, rng)
     if layer.permittivity == _AIR:
         return layer

@@ -44,9 +44,9 @@ def shape_field(
 ) -> NDArray[np.complex64]:
     """Return echoes of a scene's shapes on a grid of stage offsets, complex64 [y, x, rx, node].
 
-    `axes_m` are the offsets in x and in y, `nodes_hz` the frequencies. From `centre_m`, the image's centre on the
-    object plane, the scene file measures the places of shapes. The phase of `path_m` is removed: the rest varies slowly
-    with frequency. Amplitudes are relative to a free path of 1 m.
+    `axes_m` are the offsets in x and in y, `nodes_hz` the frequencies. The places of shapes in a scene file are
+    relative to `centre_m`, the image's centre on the object plane. The phase of the path `path_m` is removed, so that
+    the result varies slowly with frequency. Amplitudes are relative to a free path of 1 m.
     """
     x, y = np.meshgrid(*axes_m)
     disturbances = scene.disturbances

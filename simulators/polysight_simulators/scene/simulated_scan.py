@@ -29,9 +29,9 @@ MAX_ROW_BYTES = 100_000_000
 def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
     """Return the content of truth.json: true plates and points, disturbances, scene, seed, versions.
 
-    `rig` has the scene applied. `centre_m` is in the rig frame, at the plate's true height; permittivity is the drawn
-    [eps', eps''], or null (metal, layers), with the nominal one of the scene file. Tilt and height are relative to the
-    plane of the rig file and include those of the true plane.
+    `rig` has the scene applied. In the entry of a plate, `centre_m` is in the rig frame, at the plate's true height.
+    `permittivity` is the drawn [eps', eps''], or null (metal, layers); `nominal_permittivity` is that of the scene
+    file. Tilt and height are relative to the plane of the rig file and include those of the true plane.
     """
     centre = specular_midpoint_m(rig, rig.by_role("receive_h"))
     actual = draw_specimens(scene)
@@ -92,7 +92,7 @@ def _convert_to_rig_frame(at_mm: Pair, height_mm: float, centre_m: Vector) -> li
 
 
 def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return the true stage offsets of every chirp of a row in order of time: x_mm, y_mm, [points * chirps a point]."""
+    """Return the true stage offsets x_mm, y_mm of every chirp of a row in order of time, [points * chirps a point]."""
     x = (np.array(row.x_mm)[:, None] + radar.burst_mm(row.direction)).ravel()
     return x, np.full(len(x), row.y_mm)
 
@@ -180,7 +180,7 @@ def simulate(
             skipped=skipped,
         )
     layouts.require_empty(writer.folder)
-    # Before the first file: a scene that cannot be simulated leaves no folder.
+    # Done before the first file is written: a scene that cannot be simulated then leaves no folder.
     radar.prepare()
     writer.start()
     for row in plan:

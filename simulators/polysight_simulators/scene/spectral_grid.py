@@ -1,7 +1,11 @@
 """The grid on which an object field is computed: kernel positions, spatial frequencies, and offsets of the output.
 
-The field at stage offset u is the sum over object points v of the object times a kernel of w = v - u, a convolution: it
-is computed along each axis as a product of spectra, and interpolated from an oversampled grid of u.
+The field at the stage offset u is a convolution of the object A with a kernel g of the lag w = v - u, the place of an
+object point relative to the stage:
+
+    field(u) = sum over object points v of  A(v) g(v - u)
+
+It is computed along each axis as a product of spectra, and interpolated from an oversampled grid of u.
 """
 
 from dataclasses import dataclass
@@ -21,7 +25,7 @@ from polysight_simulators.scene.scene_file import Scene
 FADE_M = 0.06
 # Number of taps of the windowed sinc that interpolates the output; chosen.
 TAPS = 12
-# Kernel positions beyond those of aperture and scene, for the taps of the sinc: 6 steps of at most 2 mm.
+# Margin of kernel positions at either end for the taps of the sinc: 6 steps of at most 2 mm.
 MARGIN_M = 0.012
 # Points of the output grid per kernel position; chosen: with fewer the sinc needs more taps.
 OVERSAMPLING = 2
@@ -50,7 +54,7 @@ class Axis:
 
     @property
     def fade(self) -> Real:
-        """Fade-out of the kernel, [points]: 1 within the scene, smoothly 0 outside."""
+        """Fade-out of the kernel, [points]: 1 within the scene, falling smoothly to 0 outside."""
         w = self.w
         distance_beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
         return np.cos(np.pi / 2 * np.clip(distance_beyond, 0.0, 1.0)) ** 4
@@ -71,17 +75,17 @@ class Axis:
         return int(np.ceil((self.high_u - self.low_u) / self.step * OVERSAMPLING)) + TAPS + 1
 
 
-# Chosen: about 24 arrays of these points are in memory, of 8 or 16 bytes each: 0.8 to 1.6 GB. A scene as wide as the
-# stage (0.8 x 0.5 m) has 0.6e6.
+# Largest number of kernel positions; chosen. About 24 arrays of this size are in memory, with 8 or 16 bytes per point:
+# 0.8 to 1.6 GB. A scene as wide as the stage (0.8 x 0.5 m) has 0.6e6 points.
 MAX_KERNEL_POINTS = 4_000_000
 
 
 def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
     """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
 
-    `top_hz` is the highest frequency. A tilt moves the specular point of a plate (26 mm per degree at half a metre and
-    55 degrees of incidence), but the kernel already extends from every offset to the edges of every plate. Raises
-    ConfigError if that is too much memory.
+    `top_hz` is the highest frequency. The kernel extends from every offset to the edges of every plate. So it includes
+    the specular points of tilted plates, which a tilt moves by 26 mm per degree at half a metre and 55 degrees of
+    incidence. Raises ConfigError if the grid needs too much memory.
     """
     # The last pulse of a burst is sent about twice the mean travel after the trigger.
     travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
@@ -99,7 +103,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
         high_v = ant.centre_m[i] * 1e3 + np.max(table[:, i] + table[:, i + 2])
         spans.append(np.array([-half, half, low_v - half, high_v + half]) / 1e3 + [0, 0, -MARGIN_M, MARGIN_M])
     # The path changes fastest at the edges of the kernel and in the nearest plane (heights count away from the radars).
-    # 9 x 9 kernel positions from edge to edge, x and y.
+    # It is examined at 9 x 9 kernel positions from edge to edge, in x and y.
     kernel_m = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     nearest_z = ant.plane_z_m + min([0.0, *(p.height_mm for p in (*scene.plates, *scene.points))]) / 1e3
@@ -114,7 +118,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
                     distances_m[0] ** 2 + distances_m[1] ** 2 + (nearest_z - antenna[2]) ** 2
                 )
             steepest = max(steepest, wave * float(np.abs(slope).max()))
-        # Nyquist's step, with a tenth to spare and room for the spectrum of the fade-out (both chosen), at most 4 mm.
+        # Nyquist's step, with a margin of a tenth and one for the spectrum of the fade-out (both chosen), at most 4 mm.
         step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
         axes.append(Axis(span[0], span[1], span[2], span[3], step))
     if axes[0].points * axes[1].points > MAX_KERNEL_POINTS:
@@ -133,7 +137,7 @@ def oversample(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArr
     n = axis.points
     shape = list(spectrum.shape)
     shape[along] = n * OVERSAMPLING
-    # Zeros between the positive and the negative frequencies interpolate.
+    # Zeros between the positive and the negative frequencies make the output grid finer.
     padded = np.zeros(shape, dtype=np.complex64)
     head = (n + 1) // 2
     tail = n // 2

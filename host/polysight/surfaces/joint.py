@@ -225,8 +225,9 @@ class JointFit:
     def _find_normal_equations(self, window_indices: NDArray) -> tuple[Array, Array]:
         """Return the normal matrix N [window, 8 echoes, 8 echoes], and the right side [window, 8 echoes].
 
-        An echo's derivative by its unknown u is D[u, i] w_i, summed over i (`_find_derivatives`). So the block of N for
-        the echoes e and f is Re(conj(D_e) <w_e, w_f> D_f'), and the right side is Re(conj(D_e) <w_e, residual>).
+        An echo's derivative by its unknown u is D[u, i] w_i, summed over i (`_find_derivatives`). With <a, b> the sum
+        of conj(a) b over frequencies and positions, averaged over the RX, the block of N for the echoes e and f is
+        Re(conj(D_e) <w_e, w_f> D_f'), and the right side of e is Re(conj(D_e) <w_e, residual>).
         """
         echoes = self.amplitude.shape[1]
         count = len(window_indices)
@@ -253,7 +254,7 @@ class JointFit:
         return derivatives
 
     def _project_residual(self, window_indices: NDArray, index: int) -> NDArray[np.complex128]:
-        """Return <w_i, residual> of one echo, averaged over the RX: [window, 7]."""
+        """Return <w_i, residual> of one echo, [window, 7]."""
         factors = self.steering[window_indices, index] / len(self.fit.rx_places_m)
         added = add_rx(factors, self.residual[window_indices])
         # [window, frequency, position].
@@ -267,16 +268,19 @@ class JointFit:
         return np.einsum("wiq,wq->wi", steady, sums[:, 0]) + sums[:, 1] @ self.changing.T
 
     def _multiply_echoes(self, window_indices: NDArray, first: int, second: int) -> NDArray[np.complex128]:
-        """Return <w_i of the first echo, w_k of the second one>, averaged over the RX: [window, 7, 7].
+        """Return <w_i of the first echo, w_k of the second one>, [window, 7, 7].
 
-        With M_n [window, 6, 6] the sums of nu^n B_p B_q conj(first wave) (second wave) over frequencies and positions:
+        With S = `steady` and C = `changing`, the sums M_n [window, 6, 6] give all products:
 
-            <w_i, w_k> = S M_0 S' + S M_1 C' + (S M_1 C')' + C M_2 C',   S = `steady`, C = `changing`
+            M_n[p, q] = sum over f, d of  h(f) nu^n B_p(d) B_q(d) conj(first wave) (second wave)
+            <w_i, w_k> = S M_0 S' + S M_1 C' + (S M_1 C')' + C M_2 C'
+
+        h is the mean over the RX of the steering of both echoes, times the factor that the range gate leaves at f.
         """
         fit = self.fit
-        # Mean over the RX, [window, frequency].
+        # [window, frequency]
         steering = np.mean(self.steering[window_indices, first] * self.steering[window_indices, second].conj(), axis=1)
-        # `weights * gain` is the factor that the range gate leaves of an echo at each frequency.
+        # h nu^n [window, 3, frequency]; `weights * gain` is the factor of the range gate.
         factors = (steering * fit.weights * fit.gain)[:, None] * self.nu ** np.arange(3)[:, None]
         # M_n at the index pairs of `PAIRS`, [window, 3, 21]. The product of a wave with itself is 1.
         if first == second:

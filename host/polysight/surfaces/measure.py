@@ -3,8 +3,7 @@
 A *segment* is a connected surface: a group of points whose neighbours' paths continue each other. The *path* of an echo
 is its length from TX over the surface to RX, and `at_m` [n, 3] the stage offset at which it is measured, the middle of
 a *window* of stage positions. The *slope* and the *bend* of a path are its first and second derivatives by the stage
-offset; *curvature* is that of the surface. The *ripple* of slopes is their error by edges and by other
-echoes.
+offset; *curvature* is that of the surface. The *ripple* of slopes is their error by edges and by other echoes.
 
 H gives place, normal and curvature of a point. V sees the same point with the same normal from another stage offset,
 some 15 mm away. V's path is predicted from the point, and its phase is measured against this prediction. Separate

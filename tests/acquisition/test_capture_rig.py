@@ -1,4 +1,4 @@
-"""Which commands a `CaptureRig` sends to its cards when it is closed, and how long it waits for the end of a record."""
+"""A `CaptureRig` resets and stops its cards once, and waits for the end of their records no longer than its limit."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +15,7 @@ from polysight_shared.config import CARD_TAIL_S
 
 
 class Card(Closing):
-    """A card that notes its commands, and the limits of its waits; each wait takes `waits_s`."""
+    """A card that records its commands and the limits of its waits; each wait takes `waits_s`."""
 
     def __init__(self, board: Any, _: float) -> None:
         self.board = board
@@ -46,7 +46,8 @@ class Card(Closing):
         CLOCK.now += self.waits_s
 
     def take_status(self) -> Status:
-        return Status(0)
+        no_bit_set = Status(0)
+        return no_bit_set
 
     def close(self) -> None: ...
 
@@ -106,17 +107,18 @@ def test_a_rig_that_recorded_nothing_is_closed_without_a_command():
 
 def test_closing_within_a_row_stops_each_record_once(tmp_path):
     rig = CaptureRig(make_small_instrument())
-    rig.begin_row(0, 1, 3, tmp_path)
+    rig.begin_row(row=0, take=1, points=3, folder=tmp_path)
     assert [commands[-1] for commands in list_commands(rig)] == ["start", "start"]
     for _ in range(2):
         rig.close()
-        assert [commands.count("stop") for commands in list_commands(rig)] == [2, 2], "once for the set-up"
+        # The set-up of a card has stopped a record, too.
+        assert [commands.count("stop") for commands in list_commands(rig)] == [2, 2]
         assert [commands[-1] for commands in list_commands(rig)] == ["stop", "stop"]
 
 
 def test_a_record_that_has_ended_is_not_stopped_again_by_closing(tmp_path):
     rig = CaptureRig(make_small_instrument())
-    rig.begin_row(0, 1, 3, tmp_path)
+    rig.begin_row(row=0, take=1, points=3, folder=tmp_path)
     rig.end_row()
     commands_before = [len(commands) for commands in list_commands(rig)]
     rig.close()
@@ -125,32 +127,51 @@ def test_a_record_that_has_ended_is_not_stopped_again_by_closing(tmp_path):
 
 def test_cards_are_reset_until_a_row_has_ended_at_a_known_place(tmp_path):
     rig = CaptureRig(make_small_instrument())
-    for resets in (1, 2, 2):
-        rig.begin_row(0, 1, 3, tmp_path)
-        assert [commands.count("reset") for commands in list_commands(rig)] == [resets, resets]
-        if resets == 2:
-            rig.end_row()
+
+    def begin_row_and_count_resets() -> list[int]:
+        rig.begin_row(row=0, take=1, points=3, folder=tmp_path)
+        return [commands.count("reset") for commands in list_commands(rig)]
+
+    # The first row does not end, so that the cards are reset again before the second.
+    assert begin_row_and_count_resets() == [1, 1]
+    assert begin_row_and_count_resets() == [2, 2]
+    rig.end_row()
+    assert begin_row_and_count_resets() == [2, 2]
+    rig.end_row()
     rig.reset_before_next_row("RV")
-    rig.begin_row(0, 1, 3, tmp_path)
-    assert [commands.count("reset") for commands in list_commands(rig)] == [2, 3]
+    assert begin_row_and_count_resets() == [2, 3]
 
 
-def test_the_cards_of_incomplete_rows_share_one_wait(tmp_path):
-    """The first card takes three quarters of it, and a complete row needs none."""
-    limit_s = capture_rig._COMPLETED_TIMEOUT_S
-    for complete, expected in [((False, False), [[limit_s], [limit_s / 4]]), ((True, False), [[], [limit_s]])]:
-        rig = CaptureRig(make_small_instrument())
-        parts: Any = list(zip(rig.cards.values(), rig.receivers.values(), complete, strict=True))
-        for card, receiver, is_complete in parts:
-            card.waits_s = 0.75 * limit_s
-            receiver.is_complete = is_complete
-        rig.begin_row(0, 1, 3, tmp_path)
-        rig.end_row()
-        for (card, _, _), limits_s in zip(parts, expected, strict=True):
-            assert card.limits_s == pytest.approx(limits_s)
+LIMIT_S = capture_rig._COMPLETED_TIMEOUT_S
+
+
+@pytest.mark.parametrize(
+    ("complete", "limits_s"),
+    [
+        ((False, False), ([LIMIT_S], [LIMIT_S / 4])),
+        ((True, False), ([], [LIMIT_S])),
+    ],
+    ids=["both rows incomplete", "second row incomplete"],
+)
+def test_the_waits_for_the_cards_of_incomplete_rows_have_one_limit_together(tmp_path, complete, limits_s):
+    """Each card takes three quarters of the limit. The card of a complete row is not waited for.
+
+    `complete`: whether the row of each card is; `limits_s`: the limits of the waits for each card.
+    """
+    rig = CaptureRig(make_small_instrument())
+    cards: Any = list(rig.cards.values())
+    receivers: Any = list(rig.receivers.values())
+    for card, receiver, is_complete in zip(cards, receivers, complete, strict=True):
+        card.waits_s = 0.75 * LIMIT_S
+        receiver.is_complete = is_complete
+    rig.begin_row(row=0, take=1, points=3, folder=tmp_path)
+    rig.end_row()
+    for card, limits_of_card_s in zip(cards, limits_s, strict=True):
+        assert card.limits_s == pytest.approx(limits_of_card_s)
 
 
 @pytest.mark.parametrize(("above_s", "is_warned"), [(-0.1, True), (0.0, True), (0.1, False)])
-def test_a_silence_that_cards_keep_themselves_is_a_warning(above_s, is_warned):
+def test_a_limit_of_silence_that_is_not_above_that_of_the_cards_is_a_warning(above_s, is_warned):
+    """A card itself is silent for `CARD_TAIL_S` before the last packet of a record."""
     with CaptureRig(make_small_instrument(end_of_record_s=CARD_TAIL_S + above_s)) as rig:
         assert any("end_of_record_s" in warning for warning in rig.warnings) == is_warned

@@ -95,7 +95,7 @@ def test_the_status_of_a_scan_names_its_host_and_requests_and_ends_with_it(tmp_p
         life = read_life(tmp_path)
         assert (life.pid, life.ticks, life.killed) == (os.getpid(), read_start_ticks(os.getpid()), False)
         assert (life.doing, life.asked, life.asker) == ("rows", "", "")
-        wait_for(lambda: read_life(tmp_path).written_s != life.written_s, "the next one")
+        wait_for(lambda: read_life(tmp_path).written_s != life.written_s, "the next sign of life")
         send_command(tmp_path, ScanCommand.STOP, "the page at 192.168.1.7")
         wait_for(lambda: read_life(tmp_path).asked, "what was asked")
         assert (read_life(tmp_path).asked, read_life(tmp_path).asker) == ("stop", "the page at 192.168.1.7")
@@ -131,21 +131,26 @@ def test_a_sign_of_life_is_written_once_an_interval(tmp_path, monkeypatch):
     monkeypatch.setattr(ControlFolder, "_write", lambda _, life: written.append(life))
     with ControlFolder(tmp_path, StopRequest()) as control:
         control.open()
+        # In each look the file of every command is looked for.
         wait_for(lambda: len(looks) > 5 * len(ScanCommand), "five looks")
         assert len(written) == 1
 
 
 def test_a_killed_program_is_distinguished_from_a_silent_one(tmp_path):
-    """Also if another process has its process id now: that has another start time.
+    """A program was killed if its process id is not in use, or belongs to a process with another start time.
 
     A process of another machine cannot be seen from here, and does not count as killed.
     """
     (tmp_path / CONTROL_FOLDER).mkdir()
+    this_machine = socket.gethostname()
+    own_start = read_start_ticks(os.getpid()) or 0
+    # Linux has process ids of up to 2**22.
+    unused_pid = 2**22 + 1
     lives = [
-        (SignOfLife(os.getpid(), read_start_ticks(os.getpid()) or 0, socket.gethostname()), False),
-        (SignOfLife(os.getpid(), 1, socket.gethostname()), True),
-        (SignOfLife(2**22 + 1, 1, socket.gethostname()), True),
-        (SignOfLife(2**22 + 1, 1, "another machine"), False),
+        (SignOfLife(pid=os.getpid(), ticks=own_start, host=this_machine), False),
+        (SignOfLife(pid=os.getpid(), ticks=1, host=this_machine), True),
+        (SignOfLife(pid=unused_pid, ticks=1, host=this_machine), True),
+        (SignOfLife(pid=unused_pid, ticks=1, host="another machine"), False),
     ]
     for life, is_killed in lives:
         (tmp_path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(msgspec.json.encode(life))

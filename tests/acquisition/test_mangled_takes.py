@@ -29,7 +29,7 @@ GRIDS = [
 TROUBLES = (*NETWORK_TROUBLES, *RADAR_TROUBLES)
 # From a pulse to the end of its samples: about the published ramp, 128.5 us.
 FRAME_NS = 128_000
-# Share of the right bytes that may be masked in rows whose place and times are certain; chosen.
+# Fraction of the right bytes that may be masked in rows whose place and times are certain
 MAX_MASKED = 0.005
 
 
@@ -48,7 +48,7 @@ class Kept:
 
 def keep(sent: SentRecord, past: EarlierRecords, pulses: np.ndarray, frame: int) -> Kept:
     """Place a take and decide which of its data is stored, as acquisition does."""
-    log = log_packets(sent, pulses.size * frame, 64)
+    log = log_packets(sent, expected=pulses.size * frame, batch=64)
     # Packets from more than 5 ms before the first pulse are not of this row.
     placed, out = place_record(log, frame, past, int(pulses[0, 0]) - 5 * MS)
     frames = None
@@ -77,7 +77,7 @@ def draw_takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, SentRecord]]:
     """Yield one to three takes of a rig with their troubles, each with up to three faults."""
     rng = random.Random(seed)
     points, count, frame = GRIDS[seed % len(GRIDS)]
-    card = Adversary(rng, frame, 0, 1)
+    card = Adversary(rng, frame)
     past = EarlierRecords.after_reset()
     for number in range(rng.randint(1, 3)):
         troubles = tuple(rng.sample(TROUBLES, rng.randint(1, 3)))
@@ -98,9 +98,9 @@ def count_wrong_bytes(kept: Kept, sent: SentRecord) -> int:
 
 
 def test_no_wrong_byte_is_kept_and_few_right_ones_are_masked(request: pytest.FixtureRequest):
-    """Whether the take is committed or kept incomplete.
+    """This holds for takes that are committed and for those that are kept incomplete.
 
-    A frame is uncertain if no packet came at its pulse's time, for example because the network delayed packets.
+    Rows with packets that the network held back ("held") may be masked: no packet came at the time of their pulses.
     """
     right = 0
     masked = 0

@@ -1,4 +1,4 @@
-"""When the host's client of the Pi repeats a command, believes an event, and asks whether the Pi still answers."""
+"""The host's client of the Pi: repeated commands, events in place of lost replies, and questions to a silent Pi."""
 
 from collections import deque
 from collections.abc import Callable
@@ -101,21 +101,25 @@ def heartbeats(monkeypatch):
     return counts
 
 
+HEARTBEAT_MS = 100
+
+
 def begin_run(pi: ScriptedPi) -> None:
-    pi.begin_run(msgspec.structs.replace(RUN, heartbeat_ms=100))
+    pi.begin_run(msgspec.structs.replace(RUN, heartbeat_ms=HEARTBEAT_MS))
 
 
 def refuse_runs(number: int, scan_id: str, times: int) -> Callable[[Any], Any]:
-    """Refuse so many runs with a fault's number, while the Pi has a run of `scan_id`."""
-    left = [times]
+    """The answers of a Pi that has a run of `scan_id`, and refuses so many others with a fault's number."""
+    refusals_left = times
 
     def answer(command: Any) -> Any:
+        nonlocal refusals_left
         if isinstance(command, m.Status):
             return msgspec.structs.replace(STATUS, scan_id=scan_id)
-        left[0] -= 1
-        if left[0] >= 0:
-            return m.Refused(number=number, problem="another run is alive")
-        return m.Accepted(state="ready")
+        if refusals_left == 0:
+            return m.Accepted(state="ready")
+        refusals_left -= 1
+        return m.Refused(number=number, problem="another run is alive")
 
     return answer
 
@@ -128,10 +132,12 @@ def test_a_run_of_this_scan_that_still_counts_as_alive_is_waited_for(heartbeats)
 
 
 def test_a_run_of_this_scan_is_waited_for_ten_heartbeats(clock):
+    begin_s = clock.now
     pi = ScriptedPi(refuse_runs(int(PiFault.NOT_READY), "s", times=10**6))
     with expect_refusal(ErrorCode.REFUSED_BY_PEER, "another run is alive"):
         begin_run(pi)
-    assert clock.now == pytest.approx(100 + 10 * 0.1, abs=0.06)
+    # The client asks again at intervals of 0.05 s.
+    assert clock.now - begin_s == pytest.approx(10 * HEARTBEAT_MS / 1e3, abs=0.06)
 
 
 @pytest.mark.usefixtures("clock")
@@ -155,7 +161,7 @@ def make_row_event(kind: type, row: int, take: int) -> Any:
 
 
 @pytest.mark.parametrize("kind", [m.RowStarted, m.RowFinished])
-def test_a_row_whose_reply_is_lost_has_begun_if_an_event_of_that_take_says_so(kind):
+def test_a_row_whose_reply_is_lost_has_begun_if_there_is_an_event_of_that_take(kind):
     def lose_reply(command: Any) -> Any:
         return STATUS if isinstance(command, m.Status) else None
 
@@ -194,6 +200,7 @@ def test_a_row_whose_reply_is_lost_has_begun_if_the_pi_runs_or_holds_that_take(s
 
 @pytest.mark.parametrize(("silent_s", "questions"), [(0.0, 0), (4.9, 0), (5.1, 1)])
 def test_only_a_pi_that_is_silent_for_long_is_asked_whether_it_answers(clock, silent_s, questions):
+    """The limit of this client is 5 s."""
     pi = ScriptedPi(lambda _: STATUS)
     pi._last_heard_s = clock.now - silent_s
     assert pi.events() == []
@@ -227,7 +234,8 @@ def test_an_interrupted_jog_stops_the_stage(heartbeats):
     pi = ScriptedPi(answer)
     with pytest.raises(KeyboardInterrupt):
         pi.jog("x", 5.0, 10.0)
-    assert [type(command) for command in pi.sent[-2:]] == [m.Status, m.Abort]
+    last_two_commands = [type(command) for command in pi.sent[-2:]]
+    assert last_two_commands == [m.Status, m.Abort]
     assert heartbeats == {"started": 1, "stopped": 1}
 
 

@@ -87,11 +87,11 @@ def test_frames_are_kept_up_to_where_frames_and_packets_last_began_together(miss
 @pytest.mark.parametrize("bursts", [1, 2])
 def test_a_whole_row_of_too_few_bursts_is_not_contradicted(bursts):
     pulses = draw_pulse_times(bursts)
-    arrivals, answer = receive(pulses.reshape(-1), pulses, FRAME, np.random.default_rng(1))
+    arrivals, answer = receive(pulses.reshape(-1), pulses, FRAME, rng=np.random.default_rng(1))
     placed = place(pulses, answer, arrivals)
     assert not placed.is_timed
     assert not placed.contradicted
-    assert "needs 3 bursts" in placed.reason
+    assert "fewer than 3 bursts" in placed.reason
 
 
 def test_frames_whose_pulse_cannot_be_determined_are_masked_with_the_reason():
@@ -117,9 +117,13 @@ def test_frames_whose_pulse_cannot_be_determined_are_masked_with_the_reason():
         # No frame.
         place(pulses, answer, arrivals[:0]),
     ]
-    assert all((r.slots == -1).all() and r.reason and not r.contradicted for r in results)
-    assert len({r.reason for r in results}) >= len(results) - 1
-    assert not any(r.is_timed for r in results)
+    for result in results:
+        assert (result.slots == -1).all()
+        assert not result.contradicted
+        assert not result.is_timed
+        assert result.reason
+    # Two of the cases may have the same reason.
+    assert len({result.reason for result in results}) >= len(results) - 1
     assert "simulated time, 40 times as fast" in results[0].reason
     no_events = find_frames(Path("0000.part"), Row(0, 0.0, 0.0, 2.0, 3), [], load_published_rig())
     assert not no_events.is_timed
@@ -185,19 +189,23 @@ def test_a_complete_row_is_never_reported_as_one_with_missed_pulses(load, seed, 
 def test_one_early_frame_contradicts_a_whole_row_only_if_its_times_are_sharp(astray, contradicted):
     """A spurious edge in the pause before a burst, and a missed pulse: one frame comes at the pulse before its own.
 
-    `astray` frames of later bursts come between two pulses. Times are sharp if that are at most a tenth of all.
+    `astray` frames of later bursts come between two pulses. The times of a row are sharp if that holds for at most a
+    tenth of its frames, here 32.
     """
     pulses = draw_pulse_times(BURSTS)
     edges = pulses.copy()
     edges[1, 0] = pulses[1, 0] - 40 * MS
     edges[1, 1] = pulses[1, 0]
-    late = [(burst, pulse) for burst in range(3, BURSTS) for pulse in range(2, 14, 2)][:astray]
-    for burst, pulse in late:
+    candidates = [(burst, pulse) for burst in range(3, BURSTS) for pulse in range(2, 14, 2)]
+    for burst, pulse in candidates[:astray]:
         edges[burst, pulse] += 900_000
     arrivals, answer = receive(edges.reshape(-1), pulses, PAYLOAD, np.random.default_rng(2))
     placed = place(pulses, answer, arrivals, PAYLOAD)
     assert placed.contradicted == contradicted
-    assert contradicted or placed.slots[17] == -1
+    if not contradicted:
+        # The early frame itself, the second of burst 1, is masked.
+        early_frame = PULSES + 1
+        assert placed.slots[early_frame] == -1
 
 
 def make_bursts(first_point: int, bursts: int = 8) -> tuple[list[ReceivedCapture], int]:

@@ -183,8 +183,8 @@ def test_backend_is_that_of_the_rig_file(make_instrument):
 # --- rows that depend on the radars ---
 
 
-class Native(RadarControl):
-    """A backend with native control that reports a scripted state after each arming."""
+class ScriptedRadars(RadarControl):
+    """A radar backend that reports a scripted state of board RH after each arming."""
 
     def __init__(self, *script: RadarState) -> None:
         self._script = script
@@ -197,7 +197,9 @@ class Native(RadarControl):
         self.armed.append(frames)
 
     def states(self) -> dict[str, BoardState]:
-        state = self._script[min(len(self.armed), len(self._script)) - 1]
+        # The last state is kept.
+        armings = min(len(self.armed), len(self._script))
+        state = self._script[armings - 1]
         return {"RH": BoardState(state, "RF core fault 7"), "RV": BoardState(RadarState.ARMED)}
 
     def wait_done(self, timeout_s: float) -> list[str]:
@@ -214,15 +216,15 @@ def list_rejection_reasons(scan: ScanFolder) -> list[str]:
 
 def test_radars_are_armed_for_every_take_and_closed_at_the_end(rig, tmp_path):
     rig.cards["RV"].drop[1, 1] = {3}
-    radars = Native(RadarState.ARMED)
+    radars = ScriptedRadars(RadarState.ARMED)
     assert run_scan(rig.instrument, tmp_path / "s", radars=radars).exit_status == "success"
-    # Four rows and a retake, each with 3 points of 3 pulses.
-    assert radars.armed == [9] * 5
+    # Four rows and a retake, each with 3 points of 3 pulses
+    assert radars.armed == [3 * 3] * 5
     assert radars.closed
 
 
 def test_a_row_whose_radar_is_in_fault_is_not_begun_and_the_radar_armed_again(rig, tmp_path):
-    radars = Native(RadarState.FAULT, RadarState.ARMED)
+    radars = ScriptedRadars(RadarState.FAULT, RadarState.ARMED)
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
     assert (result.exit_status, result.retakes) == ("success", 1)
     # The first take was never sent to the stage.
@@ -234,7 +236,7 @@ def test_a_row_whose_radar_is_in_fault_is_not_begun_and_the_radar_armed_again(ri
 
 def test_radar_that_faults_within_a_row_ends_it_immediately(rig, tmp_path):
     rig.pi.hang_at = {0}
-    radars = Native(RadarState.ARMED)
+    radars = ScriptedRadars(RadarState.ARMED)
     calls = []
 
     def progress(p) -> None:
@@ -253,7 +255,7 @@ def test_radar_that_faults_within_a_row_ends_it_immediately(rig, tmp_path):
 
 def test_radar_that_missed_a_pulse_has_its_row_taken_again(rig, tmp_path):
     """This holds for the transmitter too, whose data is not recorded."""
-    radars = Native(RadarState.ARMED)
+    radars = ScriptedRadars(RadarState.ARMED)
     radars.waiting = {2: ["LS"]}
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
     assert (result.exit_status, result.retakes) == ("success", 1)

@@ -24,7 +24,7 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
 
 class HomingPi:
-    """A Pi that homes without end, or fails after `limit_s` with a reason; also the clock, in place of `time`."""
+    """A Pi that homes without end, or fails after `limit_s` with a reason. It also replaces the clock, `time`."""
 
     def __init__(self, limit_s: float) -> None:
         self.now = 0.0
@@ -55,7 +55,10 @@ class HomingPi:
         return []
 
 
-@pytest.mark.parametrize(("limit_s", "reason"), [(HOMING_TIMEOUT_S, "not homed after"), (1e9, "'homing'")])
+ENDLESS_S = 1e9
+
+
+@pytest.mark.parametrize(("limit_s", "reason"), [(HOMING_TIMEOUT_S, "not homed after"), (ENDLESS_S, "'homing'")])
 def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeypatch, limit_s, reason):
     pi: Any = HomingPi(limit_s)
     monkeypatch.setattr(ready, "time", pi)
@@ -135,7 +138,7 @@ def test_a_pi_with_other_stage_settings_is_refused_before_a_folder_is_made(rig, 
         run_scan(rig.instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
     # The only command was Hello.
-    assert rig.pi.commands[-1:] == rig.pi.commands[:1]
+    assert len(rig.pi.commands) <= 1
 
 
 def test_resuming_with_another_rig_file_on_the_pi_is_refused_until_it_has_the_old_one(rig, tmp_path):
@@ -184,11 +187,9 @@ def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
     right = rig.pi.placement_settings
     rig.pi.placement_settings = {}
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
-    next_request = StopRequest()
-    assert (
-        STAGE_NOT_REPORTED
-        in resume_scan(tmp_path / "s", on_row=lambda _: next_request.request(), stop=next_request).warnings
-    )
+    second_stop = StopRequest()
+    resumed = resume_scan(tmp_path / "s", on_row=lambda _: second_stop.request(), stop=second_stop)
+    assert STAGE_NOT_REPORTED in resumed.warnings
     rig.pi.placement_settings = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
     result = resume_scan(tmp_path / "s")
     assert result.folder.complete
@@ -228,7 +229,7 @@ def test_homing_that_fails_after_the_last_row_ends_no_scan(rig, tmp_path):
     assert ScanFolder.load(tmp_path / "s").complete
 
 
-def test_only_a_scan_that_has_all_its_rows_is_homed_after(rig, tmp_path):
+def test_the_stage_is_homed_after_a_scan_only_if_that_has_recorded_its_last_row(rig, tmp_path):
     """An operator who stopped the scan expects no motion, and a complete scan needs none."""
     stop = StopRequest()
 

@@ -1,4 +1,4 @@
-"""What becomes of a take's files: those of a committed row get their final names, those of a rejected one go."""
+"""The files of a committed row get their final names; those of a rejected row are deleted."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -23,7 +23,7 @@ def find_silent(rig, received: dict[str, int], bursts: int, age_s: float) -> lis
 
 
 @pytest.mark.parametrize("pulses", [1, 2, 16])
-def test_a_board_is_silent_when_it_sent_nothing_of_two_packets(pulses):
+def test_a_board_is_silent_if_it_sent_nothing_although_two_packets_were_due(pulses):
     rig = make_rig_with(burst={"pulses": pulses})
     two_packets_bytes = 2 * rig.card.packet_bytes
     burst_bytes = pulses * rig.frame_bytes

@@ -1,4 +1,4 @@
-"""How a take follows the Pi, the boards and requests to stop: a scripted Pi, without sockets and without waiting."""
+"""A take of a row ends with the Pi's report, a request to stop or a time limit; with a scripted Pi and no sockets."""
 
 import os
 from pathlib import Path
@@ -30,8 +30,12 @@ STATUS = m.StatusReply(
 )  # fmt: skip
 
 
+# By this the clock advances with each look at the Pi's events, and with each look at the boards' progress.
+LOOK_S = 0.5
+
+
 class Clock:
-    """Replaces `time`; it advances with each look at the Pi's events and at the boards' progress."""
+    """Replaces `time`; it advances only by looks."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -64,7 +68,7 @@ class Bench:
     """A taker with a scripted Pi, boards and radars.
 
     `batches` are the events that the Pi sends, one list at each look; `at_events` runs at each look. `journal` are
-    those that only its journal has. `progress` is the report of a board.
+    events that are lost on the way and are only in the Pi's journal. `progress` is the report of a board.
     """
 
     def __init__(self, folder: Path, clock: Clock) -> None:
@@ -81,7 +85,7 @@ class Bench:
         self.resets: list[str] = []
         self.looks_at_data = 0
         self.is_complete = True
-        self.progress = Progress(ROW.index, TAKE, 1, complete=False, last_arrival_ns=0)
+        self.progress = Progress(row=ROW.index, take=TAKE, received=1, complete=False, last_arrival_ns=0)
         self.captures: dict[str, Any] = {}
         # A pipe that is always readable: the taker's poll returns at once.
         read_end, write_end = os.pipe()
@@ -105,11 +109,12 @@ class Bench:
 
             def reports(self) -> dict[str, Progress]:
                 bench.looks_at_data += 1
-                clock.now += 0.5
+                clock.now += LOOK_S
                 return {"RV": bench.progress}
 
             def statuses(self) -> dict[str, Status]:
-                return {"RV": Status(0)}
+                no_bit_set = Status(0)
+                return {"RV": no_bit_set}
 
             def begin_row(self, *_: Any) -> None: ...
 
@@ -131,7 +136,7 @@ class Bench:
         )  # fmt: skip
 
     def _events(self) -> list[Any]:
-        self.clock.now += 0.5
+        self.clock.now += LOOK_S
         self.at_events()
         return self.batches.pop(0) if self.batches else []
 
@@ -195,8 +200,8 @@ def test_a_pi_in_a_fault_whose_journal_has_the_rows_end_has_ended_the_row(bench)
     assert bench.take().finished == make_end("fault")
 
 
-def test_a_heartbeat_from_before_the_row_is_not_believed(bench):
-    """The newest heartbeat says that the Pi is idle, but its status says that the row runs."""
+def test_the_pis_status_is_believed_rather_than_a_heartbeat_from_before_the_row(bench):
+    """The newest heartbeat reports the Pi as idle, but its status reports that the row runs."""
     bench.pi.state = "idle"
     bench.batches = [[], [], [make_end()]]
     assert bench.take().finished == make_end()
@@ -208,7 +213,7 @@ def test_data_is_not_waited_for_if_it_is_complete_or_the_scan_is_to_stop_now(ben
     bench.is_complete = not is_stopped
 
     def stop_now() -> None:
-        # The first request stops after the row, the second one at once.
+        # The first request stops after the row, the second one immediately.
         bench.stop.request()
         bench.stop.request()
 
@@ -218,20 +223,22 @@ def test_data_is_not_waited_for_if_it_is_complete_or_the_scan_is_to_stop_now(ben
     assert bench.looks_at_data == 0
 
 
-@pytest.mark.parametrize(("last_arrival_s", "waited_s"), [(0.0, 3.0), (2.0, 5.0)])
-def test_data_is_waited_for_until_nothing_came_for_the_limit(bench, last_arrival_s, waited_s):
+@pytest.mark.parametrize("last_arrival_s", [0.0, 2.0])
+def test_data_is_waited_for_until_nothing_came_for_the_limit(bench, last_arrival_s):
     bench.batches = [[*BURSTS, make_end()]]
     bench.is_complete = False
-    ended_s = bench.clock.now + 0.5
+    # The end of the row comes with the first look.
+    ended_s = bench.clock.now + LOOK_S
     arrival_ns = round((ended_s + last_arrival_s) * 1e9)
-    bench.progress = Progress(ROW.index, TAKE, 1, complete=False, last_arrival_ns=arrival_ns)
+    bench.progress = Progress(row=ROW.index, take=TAKE, received=1, complete=False, last_arrival_ns=arrival_ns)
     bench.take()
-    assert bench.clock.now - ended_s == pytest.approx(waited_s, abs=0.5)
+    silence_s = bench.clock.now - ended_s - last_arrival_s
+    assert silence_s == pytest.approx(RIG.limits.end_of_record_s, abs=LOOK_S)
 
 
 def test_a_stop_now_aborts_the_row_once_and_waits_for_its_end(bench):
     def stop_now() -> None:
-        # The first request stops after the row, the second one at once.
+        # The first request stops after the row, the second one immediately.
         bench.stop.request()
         bench.stop.request()
 
@@ -242,24 +249,26 @@ def test_a_stop_now_aborts_the_row_once_and_waits_for_its_end(bench):
     assert bench.states[3:] == [RowState.ABORTING, RowState.WRITING, RowState.CHECKING]
 
 
-def test_an_aborted_row_without_an_end_is_left_after_ten_seconds(bench):
+def test_the_end_of_an_aborted_row_is_waited_for_ten_seconds(bench):
     bench.stop.request()
     bench.at_events = bench.stop.request
     began_s = bench.clock.now
     take = bench.take()
     assert take.finished is None
-    assert bench.clock.now - began_s == pytest.approx(row._ABORT_TIMEOUT_S + 0.5, abs=1.1)
+    # The abort comes with the first look; the taker looks at the clock between two looks.
+    waited_s = bench.clock.now - began_s - LOOK_S
+    assert waited_s == pytest.approx(row._ABORT_TIMEOUT_S, abs=2 * LOOK_S + 0.1)
 
 
 def test_a_row_that_does_not_end_is_an_error_after_its_time_limit(bench):
     began_s = bench.clock.now
     with expect_refusal(ErrorCode.NO_ANSWER, "row 4 did not end"):
         bench.take()
-    assert bench.clock.now - began_s == pytest.approx(row_limit_s(RIG, ROW), abs=1.1)
+    assert bench.clock.now - began_s == pytest.approx(row_limit_s(RIG, ROW), abs=2 * LOOK_S + 0.1)
 
 
 def test_a_card_whose_frames_contradict_the_pulses_is_reset_before_the_next_row(bench, tmp_path, monkeypatch):
-    """Boards whose record is not located are not compared, unless whole frames are missing."""
+    """The frames of a board are compared with the pulses if its record is located, or whole frames are missing."""
     paths = []
 
     def find_frames(path: Path, *_: Any) -> pulse_times.PlacedFrames:
@@ -268,9 +277,11 @@ def test_a_card_whose_frames_contradict_the_pulses_is_reset_before_the_next_row(
         return pulse_times.PlacedFrames(slots, [], 3 * PULSES, contradicted=path.parent.name != "whole")
 
     monkeypatch.setattr(pulse_times, "find_frames", find_frames)
-    cases = {"whole": (True, False), "displaced": (True, False), "slipped": (False, True), "lost": (False, False)}
     bench.captures = {
-        name: SimpleNamespace(located=located, slipped=slipped) for name, (located, slipped) in cases.items()
+        "whole": SimpleNamespace(located=True, slipped=False),
+        "displaced": SimpleNamespace(located=True, slipped=False),
+        "slipped": SimpleNamespace(located=False, slipped=True),
+        "lost": SimpleNamespace(located=False, slipped=False),
     }
     bench.batches = [[*BURSTS, make_end()]]
     take = bench.take()
@@ -278,20 +289,21 @@ def test_a_card_whose_frames_contradict_the_pulses_is_reset_before_the_next_row(
     assert (list(take.frames), bench.resets) == (["whole", "displaced", "slipped"], ["displaced", "slipped"])
 
 
-def test_a_held_row_has_no_time_limit_and_is_told_once(bench):
-    """However long the Pi holds it, also if it is held just before the limit; afterwards the limit counts anew."""
-    # The taker looks at the events each 0.5 s; its clock begins at 1000 s.
-    look_s = 0.5
-    looks = int(row_limit_s(RIG, ROW) / look_s)
-    held_from_s = 1000.0 + (looks - 1) * look_s
-    held_until_s = held_from_s + 3 * looks * look_s
+def test_a_held_row_has_no_time_limit_and_one_notice(bench):
+    """The row is held just before its limit, for three times the limit. Afterwards the limit counts again from zero."""
+    # Number of looks within the limit
+    looks = int(row_limit_s(RIG, ROW) / LOOK_S)
+    held_from_s = bench.clock.now + (looks - 1) * LOOK_S
+    held_until_s = held_from_s + 3 * looks * LOOK_S
 
     def hold_for_three_limits() -> None:
-        bench.pi.state = "held" if held_from_s <= bench.clock.now < held_until_s else "running"
+        is_held = held_from_s <= bench.clock.now < held_until_s
+        bench.pi.state = "held" if is_held else "running"
 
     bench.at_events = hold_for_three_limits
-    # One limit before, three held, and nearly one after: ten looks less
-    bench.batches = [*([[]] * (5 * looks - 10)), [*BURSTS, make_end()]]
+    # The end of the row comes after one limit of running, three of being held, and nearly one more (ten looks less).
+    no_events: list[Any] = []
+    bench.batches = [*([no_events] * (5 * looks - 10)), [*BURSTS, make_end()]]
     assert bench.take().finished == make_end()
     assert len(bench.notices) == 1
     assert "row 4 is held" in bench.notices[0]

@@ -28,6 +28,7 @@ from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.config import Board
 from polysight_shared.errors import ErrorCode, ScanError
+from polysight_shared.faults import PiFault
 from polysight_shared.messages import Capture, RunStarted, RunStopped
 
 
@@ -65,11 +66,13 @@ def test_a_scan_without_faults_is_bit_exact_and_valid(rig, payload, tmp_path):
 
 
 def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
-    rig.pi.lose_events = 7
+    lost_events = 7
+    rig.pi.lose_events = lost_events
     assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     assert list_errors(tmp_path / "s") == []
     ended = load_facts(tmp_path / "s", "scan_ended")[0]
-    assert ended["events_refetched"] >= 7
+    # Those that come after a gap are fetched again, too.
+    assert ended["events_refetched"] >= lost_events
 
 
 def test_a_row_whose_reply_was_lost_runs_once(rig, tmp_path):
@@ -89,11 +92,14 @@ def test_a_row_whose_reply_was_lost_runs_once(rig, tmp_path):
 @pytest.mark.parametrize("dropped", [{0}, {5}, {25}, {0, 1, 25}])
 def test_a_row_with_lost_packets_is_retaken(rig, payload, tmp_path, dropped):
     rig.cards["RV"].drop[1, 1] = dropped
-    said = []
-    result = run_scan(
-        rig.instrument, tmp_path / "s", progress=lambda p: p.phase == "row" and p.message and said.append(p.message)
-    )
-    assert said == ["row 0", "row 1", "row 1, take 2", "row 2", "row 3"]
+    messages = []
+
+    def record_messages_of_rows(p) -> None:
+        if p.phase == "row" and p.message:
+            messages.append(p.message)
+
+    result = run_scan(rig.instrument, tmp_path / "s", progress=record_messages_of_rows)
+    assert messages == ["row 0", "row 1", "row 1, take 2", "row 2", "row 3"]
     assert (result.exit_status, result.retakes) == ("success", 1)
     scan = ScanFolder.load(tmp_path / "s")
     assert scan.committed_rows()[1].take == 2
@@ -154,7 +160,7 @@ def test_a_scan_that_was_stopped_after_a_row_resumes_and_keeps_its_rows(rig, pay
     assert result.exit_status == "abort"
     assert list(result.folder.committed_rows()) == [0, 1]
     digests_before = compute_digests(result.folder)
-    # What a killed program may leave.
+    # A killed program may leave half of a row and half of a line.
     (tmp_path / "s" / "raw" / "RH" / "0002.part").write_bytes(b"half a row")
     with (tmp_path / "s" / "manifest.jsonl").open("ab") as f:
         f.write(b'{"fact": "row_comm')
@@ -163,14 +169,14 @@ def test_a_scan_that_was_stopped_after_a_row_resumes_and_keeps_its_rows(rig, pay
     assert result.exit_status == "success"
     assert rows == [0, 1, 2, 3]
     digests_after = compute_digests(result.folder)
-    assert {k: digests_after[k] for k in digests_before} == digests_before
+    assert digests_after.items() >= digests_before.items()
     assert result.folder.read_row("RV", 3).payload.tobytes() == payload("RV", 3, rig.instrument.row_bytes)
     assert list_errors(tmp_path / "s") == []
     assert set(find_last_takes(result.folder)) == {0, 1, 2, 3}
 
 
 def test_a_scan_whose_host_was_killed_resumes_and_keeps_its_rows(rig, config, payload, tmp_path):
-    """It is killed in row 2. The Pi finishes that row; its report must not end the new take."""
+    """The host is killed in row 2. The Pi finishes that row, and its report must not end the new take of the row."""
     code = (
         "import sys\nfrom pathlib import Path\nfrom polysight_shared.config import load_instrument\n"
         "from polysight.acquisition.scan import run_scan\n"
@@ -189,7 +195,7 @@ def test_a_scan_whose_host_was_killed_resumes_and_keeps_its_rows(rig, config, pa
     assert list_errors(tmp_path / "s") == []
     result = resume_scan(tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
-    assert {k: v for k, v in compute_digests(result.folder).items() if k in digests_before} == digests_before
+    assert compute_digests(result.folder).items() >= digests_before.items()
     assert [r.take for r in result.folder.committed_rows().values()] == [1, 1, 2, 1]
     assert result.folder.read_row("RH", 2).payload.tobytes() == payload("RH", 2, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
@@ -309,6 +315,7 @@ class LateCard(FakeCard):
 @pytest.mark.parametrize("lag_ms", [0, 5, 30])
 def test_the_retake_of_a_row_that_ended_early_is_complete(make_instrument, payload, tmp_path, monkeypatch, lag_ms):
     """The Pi reports a fault in row 1. The last packet and the status arrive some ms after the reply to the stop."""
+    # The lag is well within the time for which the scan waits (200 ms).
     assert lag_ms < 1000 * capture_rig._COMPLETED_TIMEOUT_S / 2
     monkeypatch.setattr(capture_rig, "_COMPLETED_TIMEOUT_S", HANG_S)
     rig = FakeRig(make_instrument(rows=2, end_of_record_s=HANG_S))
@@ -317,8 +324,7 @@ def test_the_retake_of_a_row_that_ended_early_is_complete(make_instrument, paylo
         card.cut[1, 1] = 4 * FULL + 100
         rig.cards[board.name] = card
     rig.start_pi()
-    # Fault 103: an edge was lost.
-    rig.pi.fail_rows[1, 1] = 103
+    rig.pi.fail_rows[1, 1] = int(PiFault.EDGE_LOST)
     try:
         result = run_scan(rig.instrument, tmp_path / "s")
     finally:

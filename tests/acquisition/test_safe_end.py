@@ -26,7 +26,7 @@ from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared import messages as m
 from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, ScanError, convert_os_error
-from polysight_shared.faults import explain
+from polysight_shared.faults import PiFault, explain
 
 
 def list_motion_commands(pi) -> list[type]:
@@ -81,11 +81,10 @@ def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
     assert not begun_at_reports[0]
 
 
-# --- the stage does not move by itself --------------------------------------------------------------------------------
+# --- the stage moves only on request ----------------------------------------------------------------------------------
 
 
-# 102: alarm of the stage; 109: the journal could not be written.
-@pytest.mark.parametrize("fault", [102, 109])
+@pytest.mark.parametrize("fault", [int(PiFault.STAGE_ALARM), int(PiFault.JOURNAL_FULL)])
 def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_that_of_the_fault(rig, tmp_path, fault):
     """The Pi ends row 1 with this fault and stays in state `fault`, as after an emergency stop."""
     rig.pi.fail_rows[1, 1] = fault
@@ -104,9 +103,12 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_that_of_the_fau
     assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
 
 
-@pytest.mark.parametrize(("fault", "homes"), [(102, 0), (109, 2)])
+@pytest.mark.parametrize(("fault", "homes"), [(int(PiFault.STAGE_ALARM), 0), (int(PiFault.JOURNAL_FULL), 2)])
 def test_at_its_start_a_scan_homes_after_any_fault_but_that_of_the_stage(rig, tmp_path, fault, homes):
-    """An alarm of the stage may be its emergency stop, and a person has to look at it. `homes`: at start and end."""
+    """An alarm of the stage may be its emergency stop, and a person has to look at it.
+
+    `homes` is the number of homings: none, or one at the start and one at the end of the scan.
+    """
     rig.pi.state = "fault"
     rig.pi.fault = fault
     rig.pi.latched_reason = "the reason"
@@ -120,8 +122,7 @@ def test_at_its_start_a_scan_homes_after_any_fault_but_that_of_the_stage(rig, tm
 
 
 def test_a_row_with_a_fault_that_does_not_last_is_retaken_without_homing(rig, tmp_path):
-    # 108: the Pi did not hear from its host.
-    rig.pi.fail_rows[1, 1] = 108
+    rig.pi.fail_rows[1, 1] = int(PiFault.HOST_LOST)
     assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
     sent = list_motion_commands(rig.pi)
     # The stage is homed at the start, and not between rows.
@@ -298,7 +299,7 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
         patch.setattr(sys, "stdout", streams[1])
         # Printing the summary, which comes last, fails.
         with suppress(OSError):
-            live.scan(config, tmp_path / "s", DEFAULT, None, False, True)
+            live.scan(config, tmp_path / "s", DEFAULT, truth=None, keep_incomplete=False, process=True)
     for stream in streams:
         stream.close()
     assert validate(tmp_path / "s") == []
@@ -328,7 +329,7 @@ def test_when_processing_fails_it_is_reported_that_every_row_is_there(config, tm
 
     monkeypatch.setattr(processing, "Pipeline", broken)
     with pytest.raises(PolysightError) as e:
-        live.scan(config, tmp_path / "s", DEFAULT, None, False, True)
+        live.scan(config, tmp_path / "s", DEFAULT, truth=None, keep_incomplete=False, process=True)
     assert str(error.args[0]) in e.value.what
     assert "every row is committed" in capsys.readouterr().out
     assert f"polysight process {tmp_path / 's'}" in e.value.remedy

@@ -73,7 +73,7 @@ def test_only_a_row_that_is_done_has_all_its_pulses_and_a_remark(status, all_sen
         (drop_frame, {"kind": "frames_missing", "board": "RV"}),
         (hold_row, {"kind": "held", "board": "RV"}),
         (make_unlocated, {"kind": "unlocated", "board": "RV"}),
-        (lose_edge, {"kind": "pi_fault", "number": 103}),
+        (lose_edge, {"kind": "pi_fault", "number": int(PiFault.EDGE_LOST)}),
     ],
     ids=lambda x: x.__name__ if callable(x) else "",
 )
@@ -107,7 +107,7 @@ def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, 
 
 
 def test_a_take_that_was_stopped_on_request_has_no_other_fault(rig, tmp_path):
-    """Two requests stop a scan within its row; what is missing then is no fault of the rig."""
+    """Two requests stop a scan within its row. The missing data is not a fault of the rig."""
     rig.pi.hang_at = {0}
     stop = StopRequest()
 
@@ -128,7 +128,8 @@ def test_every_kind_of_fault_has_a_cause_a_remedy_and_a_line_in_the_specificatio
     table = SPEC.read_text(encoding="utf-8").split("| kind | what is wrong |")[1].split("\n\n")[0]
     assert set(re.findall(r"`([a-z_]+)`(?=[^|\n]*\|[^|\n]*\|$)", table, re.MULTILINE)) >= set(FaultKind)
     for kind in FaultKind:
-        fault = TakeFault(kind, "text", "RV", 103 if kind is FaultKind.PI_FAULT else 0)
+        number = int(PiFault.EDGE_LOST) if kind is FaultKind.PI_FAULT else 0
+        fault = TakeFault(kind, "text", board="RV", number=number)
         notice = make_rejection_notice(0, 1, [str(fault)], [fault.to_row_fault()], "")
         assert notice.why
         assert notice.do

@@ -1,4 +1,4 @@
-"""Faults of a take: its counts, its end and its boards differ from the plan one at a time, without a rig."""
+"""Each way in which the counts, the end or a board of a take differ from the plan is a fault of its own kind."""
 
 import threading
 from os import PRIO_PROCESS, getpriority
@@ -49,7 +49,7 @@ def test_without_a_report_the_hosts_own_reason_is_the_fault():
         ("fault", ABORTED, FaultKind.PI_FAULT),
     ],
 )
-def test_a_row_that_the_host_aborted_has_the_fault_for_which_it_did(status, aborted, kind):
+def test_the_fault_of_a_row_that_the_host_aborted_is_the_reason_of_the_abort(status, aborted, kind):
     end = make_end(status=status, fault=int(PiFault.EDGE_LOST))
     (fault,) = Take(ROW, 1, finished=end, aborted=aborted).faults(PULSES)
     assert fault.kind is kind

@@ -55,9 +55,10 @@ Gap = tuple[int, int]
 # Silence between packets that begins a new train (chosen). A radar needs 150 us between two frames (AWR2243, hardware
 # trigger), and the first packet of a frame comes only when it is full.
 SILENCE_NS = 200_000
-# A train is at the time of a pulse if it comes at most _EARLY_SHARE before the predicted arrival of that pulse's data,
-# and at most the duration of a frame plus _LATE_SHARE after it. Both are shares of the pulse period, but at most the
-# times in ns. Chosen: wide enough for the jitter of network and machine, far less than half a period.
+# A train is at the time of a pulse if it comes between `early` before and `frame + late` after the predicted arrival of
+# that pulse's data, where `frame` is the duration of a frame, early = min(_EARLY_SHARE * period, _EARLY_NS), and
+# late = min(_LATE_SHARE * period, _LATE_NS), with the pulse period. Chosen: wide enough for the jitter of network and
+# machine, far less than half a period.
 _EARLY_SHARE = 0.1
 _EARLY_NS = 200_000
 _LATE_SHARE = 0.15
@@ -65,24 +66,25 @@ _LATE_NS = 200_000
 # If more than this share of the trains is not of a single frame at the time of a pulse, the machine or the network is
 # slow, and the arrival times of the row are not *sharp*; chosen.
 _MAX_BLURRED_SHARE = 0.1
-# Number of successive trains at other pulses than their own that contradict the placement of a whole row. The same
-# number of trains before their pulses, successive or not, contradicts it too; if times are sharp, one is enough.
-# Chosen.
+# This many successive trains at other pulses than their own contradict the placement of a row without missing frames,
+# and so do this many trains, successive or not, that came before their pulses; if times are sharp, one of the latter is
+# enough. Chosen.
 _DISPLACED_TRAINS = 3
 # Bytes of one sample of all four antennas: a card drops whole ones of these (inferred).
 _SAMPLE_BYTES = 16
-# If the next train follows sooner than this share of the pulse period, a train was delayed, and the next one catches up
-# (chosen).
+# If the time to the next train is less than this share of the pulse period, the train was delayed, and the next one was
+# delayed less (chosen).
 _CATCH_UP_SHARE = 0.8
-# Smallest number of bursts whose delays from pulse to data must agree, and the largest difference between these delays:
-# a share of the pulse period, but at most the time in ns (chosen).
+# Smallest number of bursts whose delays from pulse to data must agree; chosen.
 _MIN_AGREEING_BURSTS = 3
+# Largest difference between agreeing delays: this share of the pulse period, but at most the time in ns (chosen).
 _AGREEMENT_SHARE = 0.3
 _AGREEMENT_NS = 500_000
-# Relative drift between the clocks of Pi and host: at most that of a clock which NTP slews, usually that of two
-# crystals of 50 ppm. From fewer bursts than _DRIFT_BURSTS (chosen) it is not estimated, and must be negligible.
+# Largest relative drift between the clocks of Pi and host: that of a clock which NTP slews.
 _MAX_DRIFT = 500e-6
+# Usual drift: that of two crystals of 50 ppm each.
 _USUAL_DRIFT = 100e-6
+# The drift is estimated from at least this many bursts; with fewer it must be negligible. Chosen.
 _DRIFT_BURSTS = 8
 # Rate of the host's clock over that of the pulses; outside, the pulses are in simulated time (chosen).
 _CLOCK_RATES = 0.8, 1.25
@@ -165,7 +167,8 @@ def place_frames(
         trains = _find_trains(pulses_ns, received_ns, arrivals, frame_bytes, payload_bytes, frame_ns)
     except _UndeterminedError as e:
         no_frame = np.full(received, -1, dtype=np.int64)
-        return PlacedFrames(no_frame, [], pulses, contradicted=isinstance(e, _DisturbedError), reason=str(e))
+        is_contradiction = isinstance(e, _DisturbedError)
+        return PlacedFrames(no_frame, missed=[], pulses=pulses, contradicted=is_contradiction, reason=str(e))
     if received < pulses:
         return _place_short_row(trains, received, pulses, frame_bytes)
     return _check_whole_row(trains, pulses, frame_bytes)
@@ -227,8 +230,8 @@ def _find_trains(
     # the first pulse of the burst is its bound.
     count = pulses_ns.shape[1]
     first_pulse = np.where(is_in_time, pulse_of_head, pulse_of_head // count * count)
-    # When the first packet was full, the radar had sent all frames before that pulse's, and at least one sample of that
-    # frame. The bytes of these that are beyond `first_stop` are missing.
+    # When its first packet was full, the radar had sent all frames of the pulses before `first_pulse`, and at least one
+    # sample of that pulse's frame. Of these bytes, the record has `first_stop`; the others are missing.
     low = np.where(is_single, frame_bytes * first_pulse + _SAMPLE_BYTES - first_stop, -_NO_BOUND)
     # Frames that come faster than pulses are sent make up for a delay of any length.
     to_next_ns = np.diff(came_ns[heads], append=_NO_BOUND)
@@ -263,8 +266,9 @@ def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFr
     if not contradicted and (slots < 0).all():
         reason = "the delays in this row are as long as the pauses between its bursts"
     if contradicted or reason:
-        return PlacedFrames(np.full(pulses, -1, dtype=np.int64), [], pulses, contradicted=True, reason=reason)
-    return PlacedFrames(slots, [], pulses)
+        no_slot = np.full(pulses, -1, dtype=np.int64)
+        return PlacedFrames(no_slot, missed=[], pulses=pulses, contradicted=True, reason=reason)
+    return PlacedFrames(slots, missed=[], pulses=pulses)
 
 
 def _measure_longest_run(flags: Flags) -> int:
@@ -276,13 +280,15 @@ def _measure_longest_run(flags: Flags) -> int:
 def _place_short_row(trains: _Trains, received: int, pulses: int, frame_bytes: int) -> PlacedFrames:
     """Find the pulses of the frames of a row with fewer frames than pulses."""
     # The shift never falls along the row: lower bounds hold for all later trains, upper bounds for all earlier ones.
+    # `low[k]` is the lower bound after the first k trains, `high[k]` the upper bound before the last packet of train k
+    # (of the row, for the last one), both in bytes.
     missing_end_bytes = (pulses - received) * frame_bytes
     low = np.maximum.accumulate(np.append(0, trains.low))
     high = np.minimum.accumulate(np.append(trains.high, missing_end_bytes)[::-1])[::-1]
     slots = np.full(received, -1, dtype=np.int64)
-    # A lower bound above the upper bound of a later train.
+    # The bounds contradict each other where a lower bound is above the upper bound of the same or a later train.
     if (low[1:] > high[:-1]).any():
-        return PlacedFrames(slots, [], pulses, contradicted=True)
+        return PlacedFrames(slots, missed=[], pulses=pulses, contradicted=True)
     # Bounds of each frame: the lower one of the last train whose first packet lies before it, the upper one of the
     # first train that reaches its end.
     begins = np.arange(received) * frame_bytes
@@ -311,14 +317,13 @@ def _select_frames(trains: _Trains, selected: Flags, frame_bytes: int, frames: i
 
 def _find_missed(slots: Times, pulses: int) -> list[int]:
     """Return the numbers of the pulses between those of two successive frames whose pulses are certain."""
-    # The row's begin and end count as frames with certain pulses.
-    number = np.concatenate([[-1], np.arange(slots.size), [slots.size]])
-    slot = np.concatenate([[-1], slots, [pulses]])
-    certain_trains = np.flatnonzero((slot >= 0) | (number < 0))
+    # The beginning and the end of the row count as frames with certain pulses, -1 and `pulses`.
+    slots_and_ends = np.concatenate([[-1], slots, [pulses]])
+    is_certain = slots_and_ends >= 0
+    is_certain[0] = True
     missed: list[int] = []
-    for a, b in zip(certain_trains[:-1].tolist(), certain_trains[1:].tolist(), strict=True):
-        if b == a + 1:
-            missed += range(int(slot[a]) + 1, int(slot[b]))
+    for k in np.flatnonzero(is_certain[:-1] & is_certain[1:]).tolist():
+        missed += range(int(slots_and_ends[k]) + 1, int(slots_and_ends[k + 1]))
     return missed
 
 
@@ -390,7 +395,8 @@ def _predict_arrivals(
         is_of_burst = (pulse >= 0) & (pulse < count)
         if is_of_burst.any() and (is_whole or pulse.max() == count - 1):
             points_sent.append(int(pulses_ns[burst, 0]))
-            delays.append(int((came_ns[packets] - pulses_ns[burst][np.clip(pulse, 0, count - 1)])[is_of_burst].min()))
+            sent_ns = pulses_ns[burst][pulse[is_of_burst]]
+            delays.append(int((came_ns[packets][is_of_burst] - sent_ns).min()))
     if len(points_sent) < _MIN_AGREEING_BURSTS:
         raise _DisturbedError(
             f"data of {len(points_sent)} bursts came in time: too few for the offset between the clocks"
@@ -416,13 +422,14 @@ def _predict_arrivals(
 def _estimate_drift(times: NDArray[np.float64], delay: NDArray[np.float64], pulses_ns: Times) -> float:
     """Return the relative drift of the clocks by the delays (ns) of bursts at `times` (ns).
 
-    It is the smallest magnitude within the 95 % interval of the slope; 0 with fewer bursts than `_DRIFT_BURSTS`. Raises
+    It is the drift nearest to 0 within the 95 % interval of the slope; 0 with fewer bursts than `_DRIFT_BURSTS`. Raises
     _UndeterminedError if there are so few and the row is too long to neglect the drift.
     """
     if times.size >= _DRIFT_BURSTS:
         # The ends of the 95 % interval.
         low, high = scipy.stats.theilslopes(delay, times)[2:]
-        return float(np.clip(np.clip(0.0, low, high), -_MAX_DRIFT, _MAX_DRIFT))
+        nearest_to_zero = np.clip(0.0, low, high)
+        return float(np.clip(nearest_to_zero, -_MAX_DRIFT, _MAX_DRIFT))
     if _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY_SHARE * _find_period_ns(pulses_ns):
         raise _UndeterminedError(f"{times.size} bursts came in time: too few for the drift between the clocks")
     return 0.0
@@ -455,7 +462,8 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
     events = sorted((e for e in events if e.event.pulses == rig.burst.pulses), key=lambda e: e.event.point)
     if [e.event.point for e in events] != list(range(row.points)):
         no_slots = np.full(0, -1, dtype=np.int64)
-        return PlacedFrames(no_slots, [], row.points * rig.burst.pulses, reason="capture events of the row are missing")
+        pulses = row.points * rig.burst.pulses
+        return PlacedFrames(no_slots, missed=[], pulses=pulses, reason="capture events of the row are missing")
     arrivals = read_index(path.with_suffix(".idx"))[1]
     frame_us = (rig.burst.chirps - 1) * rig.burst.chirp_us + rig.chirp.ramp_end_us
     return place_frames(
@@ -468,9 +476,9 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
 
 
 def time_before_first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
-    """Return a time shortly before the row's first pulse, in the pause before its first burst.
+    """Return a time shortly before the row's first pulse: in the pause before its first burst.
 
-    None of its frames was sent before. Host's monotonic clock, from the row's capture events; None if undetermined.
+    The time is on the host's monotonic clock. It is computed from the row's capture events; None if it cannot be.
     """
     events = sorted((e for e in events if e.event.pulses), key=lambda e: e.event.point)
     if not events or events[0].event.point != 0:
@@ -605,7 +613,11 @@ def _find_runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     # A run begins where frame or slot jumps; -2 makes the first one begin.
     starts = np.flatnonzero((np.diff(placed, prepend=-2) != 1) | (np.diff(slots[placed], prepend=-2) != 1))
     stops = np.append(starts[1:], placed.size)
-    return [(int(placed[a]), int(slots[placed[a]]), int(b - a)) for a, b in zip(starts, stops, strict=True)]
+    runs = []
+    for start, stop in zip(starts, stops, strict=True):
+        first_frame = int(placed[start])
+        runs.append((first_frame, int(slots[first_frame]), int(stop - start)))
+    return runs
 
 
 def _subtract_ranges(ranges: list[Gap], start: int, stop: int) -> list[Gap]:

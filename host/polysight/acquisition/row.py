@@ -648,7 +648,7 @@ class RowTaker:
             if capture.located or capture.slipped:
                 take.frames[name] = pulse_times.find_frames(path, take.row, take.events, self._instrument)
                 if take.frames[name].contradicted:
-                    # Another number of frames may have been sent than came: lost with the end of the record.
+                    # The radar may have sent more frames than came: the end of the record may be lost.
                     self._rig.reset_before_next_row(name)
 
 
@@ -659,7 +659,8 @@ class _SilenceCheck:
         self._rig = rig
         self._limit_ns = int(instrument.limits.end_of_record_s * NS_PER_S)
         burst_bytes = instrument.burst.pulses * instrument.frame_bytes
-        # A card sends a packet only when it is full: silence counts only after bursts that fill two packets.
+        # A card sends a packet only when it is full: silence counts only after bursts that fill two packets. Their
+        # number is rounded up.
         self._bursts = -(-2 * instrument.card.packet_bytes // burst_bytes)
         # Time of the last check, monotonic clock.
         self._checked_ns = 0

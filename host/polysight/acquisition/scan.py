@@ -78,7 +78,8 @@ from polysight_shared.tables import to_builtins
 
 # Time between two readings of the Pi's events while a scan waits; chosen.
 _POLL_S = 0.05
-# Lost steps from which on the user is warned (chosen): up to 9 degrees of phase at 77 GHz, over the way there and back.
+# Smallest loss of steps of which the user is warned (chosen). A displacement of 0.05 mm changes the path to an object
+# and back by up to 0.1 mm: 9 degrees of phase at 77 GHz.
 _LOST_STEPS_WARNING_MM = 0.05
 
 
@@ -111,7 +112,7 @@ class RunningScan:
         self._committed = set(scan.committed_rows())
         # Durations of the rows of this run.
         self._row_seconds: list[float] = []
-        # Start of the current row on the monotonic clock, later by the duration of each pause; None between rows.
+        # Start of the current row on the monotonic clock, plus the duration of the pauses in it; None between rows.
         self._row_began: float | None = None
         # Index, take number and points of the current row.
         self._current = (-1, 0, 0)
@@ -518,7 +519,7 @@ def run_scan(
         if progress is not None:
             # Report progress now, because the radars may take seconds: from now on the scan's folder exists, and the
             # caller can show it and request a stop.
-            progress(ScanProgress("check", "making the radars ready", plan.rows, 0))
+            progress(ScanProgress("check", "making the radars ready", plan.rows, committed=0))
         radars = stack.enter_context(radars or open_radar_control(instrument))
         stop = stop or StopRequest()
         return RunningScan(
@@ -612,7 +613,8 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
     """
     rows = scan.committed_rows()
     if progress is not None:
-        progress(ScanProgress("check", f"comparing {len(rows)} committed rows with their digests", scan.plan.rows, 0))
+        message = f"comparing {len(rows)} committed rows with their digests"
+        progress(ScanProgress("check", message, scan.plan.rows, committed=0))
     damaged = find_damaged_rows(scan)
     for row, faults in damaged.items():
         writer.append(RowWithdrawn(row=row, take=rows[row].take, reasons=faults, withdrawn_utc=utc_now()))
@@ -656,7 +658,8 @@ def _connect(
     `stack` closes them.
     """
     if progress is not None:
-        progress(ScanProgress("connect", "connecting to the Pi and the capture cards", instrument.grid.rows, 0))
+        message = "connecting to the Pi and the capture cards"
+        progress(ScanProgress("connect", message, instrument.grid.rows, committed=0))
     # Context.term() would wait forever for a socket that was never closed, as after an interrupt in PiClient().
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     stack.callback(context.destroy, linger=0)

@@ -233,7 +233,7 @@ class ScanEnded(Fact, frozen=True, kw_only=True, tag="scan_ended"):
 
 
 class OtherFact(Fact, frozen=True, kw_only=True, tag="other"):
-    """A fact of a `kind` that nothing here reads, or with a `problem`: its keys are not those of its kind."""
+    """A fact that is not used: its `kind` is unknown, or its keys are not those of its kind (`problem`)."""
 
     kind: str
     problem: str = ""
@@ -432,7 +432,7 @@ class Manifest:
         missing = count - self.count
         line_before_is_damaged = self._next_whole < self.count
         if missing > 0 and line_before_is_damaged:
-            # A damaged line end joins two lines: both are lost by the one fault that was found.
+            # A damaged line end joins two lines: both lines are lost, and the one fault that was found counts both.
             last = self.faults.pop()
             self.faults.append(make_manifest_fault(last.facts["line"], last.what, last.facts["lost"] + missing))
         elif missing > 0:

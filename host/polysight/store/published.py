@@ -183,11 +183,13 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
 def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64], end: int) -> NDArray[np.uint8]:
     """Move the packets of a file without the lost ones to their offsets, [byte]."""
     data = np.zeros(end, np.uint8)
-    source = np.concatenate([[0], np.cumsum(size)])
-    # Runs of packets without a loss.
-    breaks = np.flatnonzero(start[1:] != start[:-1] + size[:-1]) + 1
-    for a, b in zip([0, *breaks], [*breaks, start.size], strict=True):
-        data[start[a] : start[b - 1] + size[b - 1]] = raw[source[a] : source[b]]
+    stop = start + size
+    start_in_file = np.concatenate([[0], np.cumsum(size)])
+    # Packets between which nothing was lost, from `first` to before `end_of_run`, are moved together.
+    breaks = np.flatnonzero(start[1:] != stop[:-1]) + 1
+    for first, end_of_run in zip([0, *breaks], [*breaks, start.size], strict=True):
+        run = raw[start_in_file[first] : start_in_file[end_of_run]]
+        data[start[first] : stop[end_of_run - 1]] = run
     return data
 
 
@@ -212,10 +214,11 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full_bytes: int, zeroe
     `full_bytes` is the payload of a full packet, bytes, `zeroed_raw` the file's bytes if it is zero-filled, otherwise
     None.
 
-    With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
-    counted back from a short last packet if no position is missing and the packet is as short as that of a complete row
-    (a row that lacks a frame ends elsewhere), otherwise the first packet that arrived. If the result is neither 0 nor 1
-    but the numbers fit a record from 1, it is 1, or 0 if that packet arrived: cards count from 1, a log may from 0.
+    In a zero-filled file the packets of zeros at its beginning were lost: their number is subtracted from the sequence
+    number of the first packet that arrived. In another file the number is counted back from the last packet, if that is
+    as short as the last one of a complete row (a row that lacks a frame ends elsewhere) and no position is missing.
+    Otherwise it is that of the first packet that arrived. If the result is neither 0 nor 1, but the last number fits a
+    row that was counted from 1, the result is 1, or 0 if packet 0 arrived: cards count from 1, a log may count from 0.
     """
     expected = -(-shape.bytes // full_bytes)
     first_arrived = int(log.sequence[0])
@@ -244,7 +247,8 @@ def _find_pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     steps = np.diff(at_s)
     if count < 1 or steps.size < count:
         return np.zeros(0, np.int64)
-    typical = np.sort(steps)[-count:][count // 4]
+    longest_steps = np.sort(steps)[-count:]
+    typical = longest_steps[count // 4]
     return np.flatnonzero(steps > typical / 2) + 1
 
 
@@ -314,8 +318,9 @@ def _find_ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
     return [(int(a) * unit, min(int(b) * unit, end)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-# Name of a row's file: column and row of its start. End of the name of a board's cube.
+# Name of a row's file: column and row of its start.
 _ROW_FILE = re.compile(r"(\d+)_(\d+)\.bin")
+# End of the name of a file with a board's cube.
 SYNCED = "_synced.npy"
 
 
@@ -543,15 +548,17 @@ def _place(
     payload = np.zeros(shape.bytes, np.uint8)
     is_received = np.zeros(shape.bytes, bool)
     arrived = np.ones(size, bool)
-    for a, b in stream.lost:
-        arrived[a:b] = False
-    for (a, b), target in zip(bursts.ranges, positions * burst, strict=True):
-        if b - a != burst:
+    for start, stop in stream.lost:
+        arrived[start:stop] = False
+    for (start, end), target in zip(bursts.ranges, positions * burst, strict=True):
+        if end - start != burst:
             positions_short += 1
             continue
-        stop = min(b, size)
-        payload[target : target + stop - a] = stream.data[a:stop]
-        is_received[target : target + stop - a] = arrived[a:stop]
+        # The last burst may be cut.
+        stop = min(end, size)
+        place = slice(target, target + stop - start)
+        payload[place] = stream.data[start:stop]
+        is_received[place] = arrived[start:stop]
     payload[~is_received] = 0
     return payload, is_received, positions_short
 

@@ -185,8 +185,9 @@ class ScanFolder:
     def __init__(self, path: Path, content: Manifest) -> None:
         self.path = path
         self.content = content
-        # Cache of the committed rows: the manifest and its number of facts when it was filled, and the rows.
-        self._rows: tuple[Manifest, int, dict[int, RowCommitted]] | None = None
+        # The committed rows as they were last read, with the manifest and its number of facts at that time.
+        self._rows: dict[int, RowCommitted] = {}
+        self._rows_read_at: tuple[Manifest | None, int] = (None, 0)
         for number, fact in content.problems:
             if fact.kind == "scan_started":
                 raise self._unreadable_error(number, fact)
@@ -298,15 +299,17 @@ class ScanFolder:
 
         Raises DataError if a committed row cannot be read.
         """
-        if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
+        manifest_then, facts_then = self._rows_read_at
+        if manifest_then is not self.content or facts_then != len(self.content.facts):
             for number, fact in self.content.problems:
                 if fact.kind in ("row_committed", "row_withdrawn"):
                     raise self._unreadable_error(number, fact)
             for fact in self.facts(RowCommitted):
                 for board in fact.boards.values():
                     check_inside(self.path, board.file, "raw")
-            self._rows = (self.content, len(self.content.facts), dict(sorted(self.content.rows.copy().items())))
-        return self._rows[2]
+            self._rows = dict(sorted(self.content.rows.copy().items()))
+            self._rows_read_at = (self.content, len(self.content.facts))
+        return self._rows
 
     @property
     def manifest_faults(self) -> tuple[Finding, ...]:
@@ -383,7 +386,7 @@ class ScanFolder:
     def _read_pieces(self, path: Path, board: BoardRow, size: int) -> Iterator[NDArray[np.uint8]]:
         """Read a payload in pieces of `size` bytes (0: everything), all in the same memory, and check its CRC."""
         digest = 0
-        # At least a byte, of an empty file too: it is the step of the loop.
+        # It is the step of the loop below: at least one byte, also if the file is to be empty.
         piece_bytes = min(size, board.bytes) or board.bytes or 1
         memory = allocate_pages(piece_bytes)
         try:

@@ -89,7 +89,11 @@ class ScanTime:
 
 
 def straight_move_s(distance_mm: float, speed_mm_s: float, accel_mm_s2: float) -> float:
-    """Return the duration of a move from rest to rest: trapezoidal speed, or triangular for short distances."""
+    """Return the duration of a move from rest to rest with constant acceleration.
+
+    The two ramps of a move together take the distance v^2 / a. A longer distance d takes d / v + v / a, a shorter one,
+    on which the speed v is not reached, 2 sqrt(d / a).
+    """
     if distance_mm <= 0:
         return 0.0
     if distance_mm < speed_mm_s**2 / accel_mm_s2:
@@ -114,7 +118,7 @@ def turn_s(grid: Grid, stage: Stage) -> float:
     if stage.backlash_mm <= step:
         legs = (step,)
     else:
-        # Back beyond the row's place, then to it.
+        # The row is approached from below, over the whole backlash: the stage first moves down, then up.
         legs = (stage.backlash_mm - step, stage.backlash_mm)
     return sum(straight_move_s(leg, stage.travel_speed_mm_s, stage.accel_mm_s2) for leg in legs)
 
@@ -132,7 +136,8 @@ def tail_s(rig: Instrument) -> float:
     """Return the wait for the cards' last packet at the end of each row, after the stage has stopped, seconds."""
     if fills_whole_packets(rig):
         return 0.0
-    # From a row's last point, where its last burst begins, to the stage's rest.
+    # From a row's last point, where its last burst begins, to the stage's rest. The card sends its last packet
+    # `CARD_TAIL_S` after the end of that burst.
     run_out_s = (row_motion_s(rig.grid, rig.stage) - measuring_s(rig)) / 2
     return max(0.0, burst_duration_s(rig.burst) + CARD_TAIL_S - run_out_s)
 
@@ -286,7 +291,8 @@ def predict_burst(rig: Instrument) -> BurstForecast:
     travel_mm = stage.speed_mm_s * burst_duration_s(rig.burst)
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * sum(rig.chirp.linear_samples) / 2
     half_m = (grid.columns - 1) / 2 * grid.step_x_mm / 1e3
-    # Turn of the echo's phase during the burst, at the aperture's end in x (axis 0); an average over it is a sinc.
+    # During the burst an echo's phase changes by change = travel |d phase / dx|, most at the aperture's end in x (axis
+    # 0). The average of exp(j phase) over this change is sin(change / 2) / (change / 2).
     change_rad = travel_mm / 1e3 * abs(imaging.PhaseSlope(rig, 0).slope(half_m, middle_hz))
     average = abs(np.sinc(change_rad / (2 * np.pi)))
     return BurstForecast(

@@ -24,7 +24,7 @@ def judge_phase_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[Finding]
             "the whole array or the object was knocked, or a row was skipped: a cable of one board cannot cause "
             "this; the jump was removed from the images as measured between the rows, and the errors contain what "
             "may be left",
-            "fix the stage and the object, and scan again", 4.7,
+            "fix the stage and the object, and scan again", weight=4.7,
         ))  # fmt: skip
     shared_rows = {jump.row for jump in shared}
     for board, jumps_of_board in jumps.items():
@@ -36,7 +36,7 @@ def judge_phase_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[Finding]
             "a cable or connector is loose or was touched, or the board was knocked; the direct path does not show "
             "this; the jump was removed from the images as measured between the rows, and the errors contain what "
             "may be left",
-            "fix cables and boards, and scan again", 4.7,
+            "fix cables and boards, and scan again", weight=4.7,
         ))  # fmt: skip
     return reasons
 
@@ -73,7 +73,7 @@ def judge_displaced_rows(rms_mm: float) -> list[Finding]:
         "care", f"rows of the stage are {rms_mm:.1f} mm (rms) from where they were commanded",
         "both boards show the same shifts from row to row: the stage loses steps, has play or slips along y; plates are"
         " blurred, and their V / H changes from row to row",
-        "check the belt or screw, the current and the speed of the stage's y axis; scan again", 4.6,
+        "check the belt or screw, the current and the speed of the stage's y axis; scan again", weight=4.6,
     )]  # fmt: skip
 
 
@@ -85,5 +85,5 @@ def judge_phase_drift(range_rad: float, left_rad: float) -> list[Finding]:
         "care", f"the phase of V / H drifts over the rows by {np.degrees(range_rad):.0f} degrees",
         "the phase of one board changes during the scan: a cable that bends or warms up, or a board that warms up; it"
         f" was removed from the images, and the errors contain what may be left, {np.degrees(left_rad):.0f} degrees",
-        "let the boards warm up for half an hour; fix the cables so that the stage does not bend them", 4.65,
+        "let the boards warm up for half an hour; fix the cables so that the stage does not bend them", weight=4.65,
     )]  # fmt: skip

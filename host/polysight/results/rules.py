@@ -2,8 +2,8 @@
 
 A finding says what was found, why it matters and what to do; `join_reasons` joins them to a verdict. Its level is
 `none`, no result (limits with NONE), or `care`, use the result with care (limits with CARE). All limits are constants
-of this module, chosen where no source is given. The last argument of `reason` is the finding's weight, which orders the
-findings of one level, largest first. P is H / V relative to metal.
+of this module, chosen where no source is given. The chosen `weight` of a finding orders those of one level, largest
+first. P is H / V relative to metal.
 """
 
 from __future__ import annotations
@@ -101,10 +101,10 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0, is_filled: bo
         reasons.append(reason(
             level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * rows_absent:.1f} % of the positions)",
             "the scan was stopped, or rows were lost; plates there are missing or distorted",
-            f"`polysight resume SCAN` records the missing rows{advice[level]}", 5 + rows_absent,
+            f"`polysight resume SCAN` records the missing rows{advice[level]}", weight=5 + rows_absent,
         ))  # fmt: skip
     reasons += [
-        reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
+        reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", weight=6.0)
         for fault in coverage.manifest
     ]
     if coverage.frames_planned:
@@ -176,7 +176,7 @@ def judge_dead_rx(board: str, dead: Mapping[int, Sequence[int]], rows: int) -> l
             "it gives only noise, zeros or less than a hundredth of the others' power: its antenna, mixer or "
             "connection is dead; the whole image is made from the board's other RX",
             "the results are valid, with more noise; `polysight doctor` shows each RX: reset the board, or replace "
-            "it", 3.2,
+            "it", weight=3.2,
         ))  # fmt: skip
     return reasons
 
@@ -191,7 +191,7 @@ def judge_rx_order(board: str, order: Sequence[int]) -> list[Finding]:
         "the phases of direct path and echo fit these places; lanes are exchanged, or a program lists the RX in its own"
         " order; the image of the board is wrong",
         f"write rx_order = {list(order)} for {board} ([[boards]] of the rig file, and of the scan's own copy), or"
-        " correct the order where it is made; process again", 10.5,
+        " correct the order where it is made; process again", weight=10.5,
     )]  # fmt: skip
 
 
@@ -201,19 +201,20 @@ def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None,
         return [reason(
             "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
             "without it no position is synchronised, and the images are meaningless",
-            "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
+            "clear the line of sight from transmitter to receiver; check that the transmitter is on", weight=10.0,
         )]  # fmt: skip
     reasons = []
     if is_known(snr_db) and snr_db < DIRECT_SNR_CARE_DB:
         reasons.append(reason(
             "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
             "it is partly blocked, or the antennas point elsewhere; it is the reference of all phases",
-            "clear the line of sight; check the antennas' direction", 3.0,
+            "clear the line of sight; check the antennas' direction", weight=3.0,
         ))  # fmt: skip
     if is_known(phase_rad) and phase_rad > DIRECT_PHASE_CARE_RAD:
         reasons.append(reason(
             "care", f"{board}: residual phase {phase_rad:.3f} rad from position to position (0.004 is usual)",
-            "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
+            "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report",
+            weight=2.5,
         ))  # fmt: skip
     return reasons
 
@@ -233,7 +234,7 @@ def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
                     "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
                 )
             do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
-            reasons.append(reason("care", problem, cause, do, 3.5))
+            reasons.append(reason("care", problem, cause, do, weight=3.5))
     return reasons
 
 
@@ -251,19 +252,19 @@ def judge_patches(
             "if a plate is as large as the image, there is no background from which it stands out; a table, a wall or "
             "noise alone look the same, so the region does not count as a patch",
             "image a larger area (image.columns, image.rows), lay a smaller plate, or"
-            " draw a box on it (polysight label; process --labels)", 9.0,
+            " draw a box on it (polysight label; process --labels)", weight=9.0,
         )]  # fmt: skip
     if patches == 0:
         return [reason(
             "none", "no patch was found", "nothing in the image stands out from its background",
-            "check that the object lies on the plane and in the image (polysight image)", 9.0,
+            "check that the object lies on the plane and in the image (polysight image)", weight=9.0,
         )]  # fmt: skip
     if len(refused) == patches:
         faults = sorted(set(refused.values()))
         return [reason(
             "none", f"none of the {patches} patches is a plate: {'; '.join(faults)}",
             "there is no flat object on the plane, or the data are noise",
-            "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
+            "look at the images; check the direct path and the range profile (polysight doctor)", weight=9.0,
         )]  # fmt: skip
     patches_by_reason: dict[str, list[int]] = {}
     for label, fault in refused.items():
@@ -275,7 +276,7 @@ def judge_patches(
                 f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
                 "no brighter than the background scatters (sidelobes, clutter, weak plates), or it touches a patch",
                 "lay plates apart; draw a box where a plate lies (polysight label; process --labels)",
-                0.5,
+                weight=0.5,
             )
         ]
     else:
@@ -286,7 +287,7 @@ def judge_patches(
             f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {fault}",
             "results hold for one flat plate per patch",
             "move the plates apart, or draw their boxes (polysight label; process --labels)",
-            2.0,
+            weight=2.0,
         )
         for fault, labels in patches_by_reason.items()
     ]
@@ -314,7 +315,7 @@ def judge_metal(
         return [reason(
             "care" if is_likely or only_patch else "none",
             f"the given metal reference ({patch}) does not look like metal",
-            "relative to the direct path it reflects less of V than of H; no metal does this", do, 8.0,
+            "relative to the direct path it reflects less of V than of H; no metal does this", do, weight=8.0,
         )]  # fmt: skip
     # Before paint: where other patches speak against the metal, a dielectric explains them better than a coating does.
     if is_given and culprit is not None and not is_likely:
@@ -324,7 +325,8 @@ def judge_metal(
             "unusual values",
             "the others fit a dielectric reference better; thin plates, liquids, or H and V of different places may "
             "also cause this",
-            f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
+            f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out",
+            weight=4.4,
         )]  # fmt: skip
     paint = []
     if painted > PAINT_REPORTED:
@@ -334,20 +336,20 @@ def judge_metal(
             f"the {given}metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
             "relative to it all patches have the same additional phase of V / H; a coating on metal causes this, "
             "and also a wet plate instead of metal; permittivities are corrected for a coating, with its error",
-            f"take the paint or film off {patch}, or use bare metal", 2.7,
+            f"take the paint or film off {patch}, or use bare metal", weight=2.7,
         )]  # fmt: skip
     if is_given or is_certain:
         return paint
     if is_likely:
         doubt = reason(
             "care", f"the metal reference ({patch}) is probably metal, but this is not certain",
-            "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
+            "a wet or conducting plate could look like it; all permittivities depend on it", do, weight=2.8,
         )  # fmt: skip
         return [doubt, *paint]
     cause = "relative to it the other patches are impossible materials, or too few of them give evidence"
     if only_patch:
         cause = "nothing else in the scene can show that it is metal"
-    return [reason("none", f"no metal reference: {patch} is not shown to be metal", cause, do, 8.0)]
+    return [reason("none", f"no metal reference: {patch} is not shown to be metal", cause, do, weight=8.0)]
 
 
 def judge_dark_reference(patch: str, brightest: int, brighter_db: float) -> list[Finding]:
@@ -358,7 +360,7 @@ def judge_dark_reference(patch: str, brightest: int, brighter_db: float) -> list
         "care",
         f"the given metal reference ({patch}) is {brighter_db:.0f} dB darker in H than patch {brightest}",
         "nothing reflects more than metal: it is not metal, it is tilted, or its box is not on it",
-        "look at the picture of H in the report, and give the box of the metal", 5.0,
+        "look at the picture of H in the report, and give the box of the metal", weight=5.0,
     )]  # fmt: skip
 
 
@@ -378,7 +380,7 @@ def judge_leakage(measured: bool, estimated: bool, relative_error: float) -> lis
         "care",
         f"leakage was {source}: permittivities are uncertain by {share}, names less reliable",
         "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
-        "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
+        "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", weight=1.5,
     )]  # fmt: skip
 
 
@@ -397,13 +399,14 @@ def judge_plane(
         return [reason(
             "care",
             f"the plane was not found; the angle is the rig file's{error}",
-            "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
+            "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)",
+            weight=2.0,
         )]  # fmt: skip
     if abs(offset_mm) > PLANE_GATE_MM:
         return [reason(
             "none", f"the plates lie {offset_mm:+z.0f} mm off the rig file's plane",
             "they are at the edge of the range gate",
-            "measure geometry.object_distance_mm and correct the rig file", 7.0,
+            "measure geometry.object_distance_mm and correct the rig file", weight=7.0,
         )]  # fmt: skip
     reasons = []
     certain_tilt = max(abs(t) - std for t, std in zip(tilt_deg, tilt_std_deg, strict=True))
@@ -412,13 +415,13 @@ def judge_plane(
         reasons.append(reason(
             "care", f"the plates lie {offset_mm:+z.1f} mm off the rig file's plane; the angle was corrected for it",
             "the object is at another distance, or object_distance_mm is wrong",
-            "correct geometry.object_distance_mm in the rig file", 1.6,
+            "correct geometry.object_distance_mm in the rig file", weight=1.6,
         ))  # fmt: skip
     if certain_tilt > PLANE_TILT_DEG:
         reasons.append(reason(
             "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
             "tilted plates reflect past the scanned positions",
-            "lay the plates parallel to the stage", 1.4,
+            "lay the plates parallel to the stage", weight=1.4,
         ))  # fmt: skip
     return reasons
 
@@ -437,12 +440,12 @@ def judge_copies(
         return [reason(
             "care", f"patches {', '.join(map(str, labels))} may repeat the plates, {place_text}",
             "positions without data repeat the plates in the image; these patches may be plates that are distorted",
-            f"record the missing positions; {RECONSTRUCT}", 3.5,
+            f"record the missing positions; {RECONSTRUCT}", weight=3.5,
         )]  # fmt: skip
     return [reason(
         "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place_text}",
         "a second path in addition to the direct path (multipath) modulates the scan; the plates are disturbed equally",
-        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.5,
+        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", weight=4.5,
     )]  # fmt: skip
 
 
@@ -459,7 +462,7 @@ def judge_image_shift(apart_mm: tuple[float, float], has_drift: bool = False) ->
     return [reason(
         "care",
         f"the images of H and V were {distance:.1f} mm apart (x {apart_mm[0]:+z.1f}, y {apart_mm[1]:+z.1f} mm)",
-        cause, do, 1.9,
+        cause, do, weight=1.9,
     )]  # fmt: skip
 
 
@@ -472,7 +475,7 @@ def judge_drift(amplitude: float, phase_rad: float, probability: float) -> list[
     return [reason(
         "care", f"V / H drifts by {100 * amplitude:.0f} % and {np.degrees(phase_rad):.0f} degrees between the plates",
         "the gains of the boards change during the scan (temperature); it is corrected to about a half",
-        "let the boards warm up for half an hour; put the metal into the middle of the scan", 2.7,
+        "let the boards warm up for half an hour; put the metal into the middle of the scan", weight=2.7,
     )]  # fmt: skip
 
 
@@ -488,13 +491,13 @@ def judge_fringes(probability: float, has_gaps: bool = False, behind: float = 0.
         return [reason(
             "care", what, "positions without data cause this in the image", "record the missing positions; "
             f"{RECONSTRUCT}",
-            2.8,
+            weight=2.8,
         )]  # fmt: skip
     if is_known(behind) and behind > BACKGROUND_CARE:
         return [reason(
             "care", what, "objects behind the plates shine through them and cause this; a second path causes "
             "it, too",
-            "cover objects behind the plates with absorber, or move them 300 mm away", 2.8,
+            "cover objects behind the plates with absorber, or move them 300 mm away", weight=2.8,
         )]  # fmt: skip
     return [reason(
         "care", what,
@@ -502,7 +505,7 @@ def judge_fringes(probability: float, has_gaps: bool = False, behind: float = 0.
         "bright edges of "
         "the plates, and a table that shines through them, look alike",
         "take reflectors away from the line between transmitter and receivers; cover objects behind the plates with "
-        "absorber", 3.0,
+        "absorber", weight=3.0,
     )]  # fmt: skip
 
 
@@ -522,7 +525,7 @@ def judge_disturbed_plates(errors: Mapping[int, float], has_gaps: bool = False) 
         action = f"record the missing positions; {RECONSTRUCT}"
     return [reason(
         "care", f"V / H changes within {patches}: an error of up to {100 * max(above.values()):.0f} % in permittivity",
-        cause, action, 2.5,
+        cause, action, weight=2.5,
     )]  # fmt: skip
 
 
@@ -534,7 +537,7 @@ def judge_reference_tilt(tilt_deg: tuple[float, float]) -> list[Finding]:
     return [reason(
         "care", f"the metal plate of the reference scan was tilted by {largest_tilt_deg:+z.1f} degrees",
         "the polarisation turns with it, in all plates equally, as if the boards had turned; corrected to a quarter",
-        "lay the metal plate parallel to the stage, and scan it again", 4.1,
+        "lay the metal plate parallel to the stage, and scan it again", weight=4.1,
     )]  # fmt: skip
 
 
@@ -545,7 +548,7 @@ def judge_moved_boards(probability: float) -> list[Finding]:
     return [reason(
         "care", f"boards have turned since their leakage was measured, with a probability of {probability:.2f}",
         "the patches fit materials only with another leakage; theirs is estimated and counted in the error bars",
-        "fix the boards and measure the leakage again: `polysight leakage` (docs/how-to/calibration.md)", 4.0,
+        "fix the boards and measure the leakage again: `polysight leakage` (docs/how-to/calibration.md)", weight=4.0,
     )]  # fmt: skip
 
 
@@ -556,7 +559,7 @@ def judge_halo(level: float) -> list[Finding]:
     return [reason(
         "care", f"V has a halo around the metal, {20 * np.log10(level):.0f} dB, that H does not have",
         "the receiver of V is overdriven (clipping): the metal's V is too weak, its neighbours are disturbed",
-        "lower the gain of the receivers (rx_gain_db), or use a smaller piece of metal", 4.2,
+        "lower the gain of the receivers (rx_gain_db), or use a smaller piece of metal", weight=4.2,
     )]  # fmt: skip
 
 
@@ -567,7 +570,7 @@ def judge_background(relative_std: float) -> list[Finding]:
     return [reason(
         "care", f"objects behind the plates disturb P by {100 * relative_std:.0f} %, which the error bars contain",
         "a table, a wall or a holder behind them returns waves too, and they add to those of the plates",
-        "cover it with absorber, or move it 300 mm away from the plates", 2.9,
+        "cover it with absorber, or move it 300 mm away from the plates", weight=2.9,
     )]  # fmt: skip
 
 
@@ -583,7 +586,7 @@ def judge_flatness(
         return [reason(
             "care", f"plates are rough, wavy or bent: the phase of H scatters by {np.degrees(relief_rad):.0f} degrees",
             "H and V see an uneven surface from different places; the errors are larger, and include this scatter",
-            "lay flat plates, or press them onto a plane", 2.1,
+            "lay flat plates, or press them onto a plane", weight=2.1,
         )]  # fmt: skip
     if not all(map(is_known, ripple)) or max(ripple) <= RIPPLE_CARE:
         return []
@@ -602,7 +605,7 @@ def judge_flatness(
     ripple_deg = np.degrees(ripple[1])
     return [reason(
         "care", f"V / H ripples by {100 * ripple[0]:.0f} % and {ripple_deg:.0f} degrees inside the plates",
-        cause, action, 2.4,
+        cause, action, weight=2.4,
     )]  # fmt: skip
 
 
@@ -618,7 +621,7 @@ def judge_tilts(across_deg: Mapping[int, float]) -> list[Finding]:
     return [reason(
         "care", f"patch {steepest} rises by {tilted[steepest]:+z.1f} degrees across the plane of incidence{remark}",
         "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
-        "lay plates and metal flat; put spacers under the tilted one", 1.3,
+        "lay plates and metal flat; put spacers under the tilted one", weight=1.3,
     )]  # fmt: skip
 
 
@@ -633,7 +636,7 @@ def judge_passivity(refused: Mapping[int, Finding]) -> list[Finding]:
         subject = f"patch {patches[0]} has"
         if len(patches) > 1:
             subject = f"patches {', '.join(map(str, patches))} have"
-        reasons.append(reason("care", f"{subject} no permittivity: {fault.what}", fault.why, fault.do, 2.2))
+        reasons.append(reason("care", f"{subject} no permittivity: {fault.what}", fault.why, fault.do, weight=2.2))
     return reasons
 
 
@@ -645,7 +648,7 @@ def judge_smears(smears: Mapping[int, Finding]) -> list[Finding]:
     subject = f"patch {next(iter(smears))} is not an object, but"
     if len(smears) > 1:
         subject = f"patches {', '.join(map(str, smears))} are not objects, but each is"
-    return [reason("care", f"{subject} {fault.what}", fault.why, fault.do, 1.9)]
+    return [reason("care", f"{subject} {fault.what}", fault.why, fault.do, weight=1.9)]
 
 
 def judge_exchange(stronger_v: Sequence[int], plates: int) -> list[Finding]:
@@ -658,7 +661,7 @@ def judge_exchange(stronger_v: Sequence[int], plates: int) -> list[Finding]:
     return [reason(
         "none", f"H and V may be exchanged: patches {', '.join(map(str, stronger_v))} reflect more V than H",
         "relative to metal no dielectric reflects p more than s; or the metal reference is a dielectric",
-        "exchange the images or the boards (rig file, section `boards`), or name another metal reference", 8.5,
+        "exchange the images or the boards (rig file, section `boards`), or name another metal reference", weight=8.5,
     )]  # fmt: skip
 
 
@@ -672,7 +675,8 @@ def judge_brightness(off: Mapping[int, float]) -> list[Finding]:
             reasons.append(reason(
                 "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
                 "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",
-                "fit it as a layer (polysight permittivity --layer), or lay it flat, without objects near it", 1.7,
+                "fit it as a layer (polysight permittivity --layer), or lay it flat, without objects near it",
+                weight=1.7,
             ))  # fmt: skip
     return reasons
 
@@ -684,5 +688,5 @@ def judge_incidence(angle_deg: float, library_deg: float | None) -> list[Finding
     return [reason(
         "care", f"the scan has an incidence angle of {angle_deg:.2f} degrees, the library {library_deg:.2f}",
         "the ratio of a material changes by 10 % in a degree: names may be wrong",
-        "make a library at this angle, or move the plane", 1.8,
+        "make a library at this angle, or move the plane", weight=1.8,
     )]  # fmt: skip

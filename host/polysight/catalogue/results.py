@@ -42,9 +42,11 @@ FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES_FILE, SURFACE, POINTS)
 EXPORTS = (".mat", ".csv", ".nc")
 # Materials of the library that a probe lists; chosen.
 MAX_NEAREST = 5
-# The range profile: its reach to either side of the place, its points, and its lowest level below the highest; chosen.
+# Reach of the range profile to either side of the place; chosen.
 PROFILE_REACH_M = 0.3
+# Number of its points; chosen.
 PROFILE_POINTS = 121
+# Lowest level that it shows, relative to the highest; chosen.
 PROFILE_FLOOR_DB = -50.0
 # Smallest spread of a material's ratio between its patches, each part; chosen, since a material of one patch has none.
 LEAST_SPREAD = 5e-3
@@ -512,7 +514,7 @@ def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np
     """Return the index of the nearest of `second` for each of `first` (mm), and True if it is within half a pixel."""
     nearest_index = np.abs(first[:, None] - second[None, :]).argmin(axis=1)
     pixel = max(abs(second[1] - second[0]), abs(first[1] - first[0]))
-    # A hundredth allows for rounding.
+    # Half a pixel, and a hundredth of one for rounding.
     return nearest_index, np.abs(first - second[nearest_index]) <= pixel * 0.51
 
 
@@ -570,6 +572,7 @@ def _describe_pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
     imag = round(difference.imag, 4)
     if not np.isfinite(covariance).all() or np.linalg.det(covariance) <= 0:
         return msgspec.structs.replace(pair, difference=PermittivityDifference(real, imag))
+    # The difference d = (real, imaginary) in standard deviations is sqrt(d^T C^-1 d) with the covariance C.
     parts = np.array([difference.real, difference.imag])
     real_std, imag_std = (round(float(std), 4) for std in np.sqrt(np.diag(covariance)))
     return msgspec.structs.replace(

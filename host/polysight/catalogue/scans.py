@@ -36,9 +36,9 @@ PART_S = 0.1
 """Length of the parts in which a list is read before it is asked for, and of the pauses between them; chosen."""
 PROGRAM_FOLDER = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
-# The deepest level of folders that scans are searched in, and the most scans that are listed below one folder of the
-# root; chosen.
+# Deepest level of folders in which scans are searched for; chosen.
 MAX_DEPTH = 4
+# Largest number of scans that are listed below one folder of the root; chosen.
 MAX_SCANS = 5000
 # End of a program's log that is read: its last messages; chosen.
 LOG_BYTES = 16384

@@ -40,9 +40,9 @@ VIEWS = (
     ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),
     ((0, 2), "From above", ("x (mm)", "z (mm), away from the rig")),
 )
-# About how many normals are drawn in a view of a surface (up to twice as many), and their length; more of them would
-# hide the points; chosen.
+# Number of normals that are drawn in a view of a surface, up to twice as many; more would hide the points. Chosen.
 NORMALS_SHOWN = 60
+# Length of a drawn normal; chosen.
 NORMAL_MM = 12.0
 # Most segments that are described below a surface; chosen.
 MAX_LINES = 8
@@ -59,16 +59,18 @@ FIGURES: dict[str, str] = {
 }
 # Pixels further out than this share of a patch's box belong to its edge, where two materials mix; chosen.
 _INSIDE_SHARE = 0.6
-# Range of the phase of P that the colours span: percentiles of the pixels, at least and at most this wide; chosen.
+# The colours of the phase of P span these percentiles of the pixels' phases; chosen.
 _PERCENTILES = (5.0, 95.0)
+# They span at least this range; chosen.
 _LEAST_DEG = 20.0
+# A wider range counts as the whole circle; chosen.
 _MAX_DEG = 300.0
 # Outlines of boxes drawn by hand.
 _METAL_BOX = "#ff9e3d"
 _OTHER_BOX = "#ffffff"
 # Levels below the peak that the images of `focus` show; chosen.
 _FOCUS_RANGE_DB = 30.0
-# Room around patches and plates: beside them, below them, and above them, where their names stand; chosen by eye.
+# Room on both sides of patches and plates, below them, and above them, where their names are written; chosen by eye.
 _SIDE_ROOM_MM = 20
 _LOWER_ROOM_MM = 12
 _UPPER_ROOM_MM = 24

@@ -77,6 +77,7 @@ def region_matrix(estimate: PermittivityFigures, share: float) -> Array | None:
         return None
     matrix = estimate.spread.matrix
     if share == min(SHARES) and estimate.half_widths_68 is not None:
+        # Both axes shrink to the half widths that were found: C_ij becomes s_i C_ij s_j.
         shrinkage = np.array(estimate.half_widths_68) / np.sqrt(np.diag(matrix))
         matrix = matrix * np.outer(shrinkage, shrinkage)
     return matrix

@@ -165,12 +165,12 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
                 normal = np.exp(-(x**2) / (2 * bound**2)) / (bound * np.sqrt(2 * np.pi))
                 ax.plot(x, normal, color="#CC6677", lw=1.2, label=f"Cramér-Rao, one tone {bound:.3g}")
             if name == "referenced" and i < 2:
+                published_std = PUBLISHED_STD[QUANTITIES[i]]
                 for sign in (-1, 1):
-                    ax.axvline(sign * PUBLISHED_STD[QUANTITIES[i]], color=INK, lw=0.8, ls=":")
-                ax.plot([], [], color=INK, lw=0.8, ls=":", label=f"paper ±{PUBLISHED_STD[QUANTITIES[i]]:g}")
-                ax.set_xlim(
-                    -1.1 * max(reach, PUBLISHED_STD[QUANTITIES[i]]), 1.1 * max(reach, PUBLISHED_STD[QUANTITIES[i]])
-                )
+                    ax.axvline(sign * published_std, color=INK, lw=0.8, ls=":")
+                ax.plot([], [], color=INK, lw=0.8, ls=":", label=f"paper ±{published_std:g}")
+                limit = max(reach, published_std)
+                ax.set_xlim(-1.1 * limit, 1.1 * limit)
             ax.legend(fontsize=7, loc="upper right", frameon=False)
     return encode_png(fig)
 

@@ -1,4 +1,4 @@
-"""Reflection of a half space: Eq. 3 inverts Eq. 2, passive media, metal, Brewster angle, unknown values.
+"""Reflection of a half space: passive media, metal, the Brewster angle, total reflection, and values that are NaN.
 
 Eq. 2 of the paper (`fresnel`) gives r_s and r_p of a permittivity, Eq. 3 the permittivity of the ratio r_s / r_p.
 """
@@ -32,7 +32,7 @@ def test_permittivity_is_the_same_for_a_ratio_and_its_reciprocal(modulus, phase,
 
 @given(st.floats(0.01, 60.0), angle)
 def test_a_medium_without_loss_is_the_limit_of_little_loss(re, theta):
-    """Also where it reflects totally: the root whose wave decays is taken."""
+    """This holds for total reflection, too, where the square root with a decaying wave is taken."""
     without_loss = fresnel(re + 0j, theta)
     with_little_loss = fresnel(re - 1e-12j, theta)
     # At the angle of total reflection the coefficients change as the root of the loss: 1e-6 times some factor.
@@ -55,7 +55,7 @@ def test_metal_is_one_at_every_angle_and_the_pole_of_eq3():
     np.testing.assert_array_equal(r_p, -1)
     np.testing.assert_array_equal(ratio_from_permittivity(np.inf, theta), 1)
     assert np.isinf(permittivity_from_ratio(1.0, theta)).all()
-    # A permittivity of 3e5, as a poor conductor has, is nearly metal.
+    # A poor conductor, with a permittivity of 3e5, is nearly metal: its ratio differs from 1 by 0.004.
     assert abs(ratio_from_permittivity(1.29e5 - 3.05e5j, np.radians(55.0)) - 1) < 0.01
 
 
@@ -111,7 +111,8 @@ def test_brewster_angle_is_where_p_vanishes():
     assert np.degrees(theta) == pytest.approx(63.4349, abs=1e-3)
     r_s, r_p = fresnel(4.0, theta)
     assert abs(r_p) < 1e-12
-    assert abs(r_s) > 0.5
+    # Eq. 2 at Brewster's angle: r_s = (1 - eps) / (1 + eps)
+    assert r_s == pytest.approx((1 - 4.0) / (1 + 4.0))
     assert permittivity_from_ratio(np.inf, theta) == pytest.approx(4.0)
 
 

@@ -70,7 +70,8 @@ def test_leakage_and_gain_are_recovered_from_a_plate_and_two_orientations(a, b, 
 def test_with_noise_crosstalk_and_imbalance_stay_below_the_limits(a, b, g, seed):
     """The noise of 0.05 is 26 dB below the signal in each of 400 pixels.
 
-    Their mean has an error of 0.05 / sqrt(400) = 0.0025 in each channel; the limits are chosen: 4 and 10 times that.
+    Their mean has an error of 0.05 / sqrt(400) = 0.0025 in each channel, and the estimate joins several such errors:
+    over 50 draws the crosstalk was up to 0.006 and the imbalance up to 0.009.
     """
     truth = Leakage(a, b, g, 0.0)
     rng = np.random.default_rng(seed)
@@ -91,7 +92,7 @@ def test_more_orientations_give_a_least_squares_solution_and_a_residual(a, b, g,
     assert exact.residual < 1e-7
     assert compute_remaining(exact, truth) == pytest.approx((0, 0), abs=1e-7)
     other_measurements = [measure_metal_standard(truth, w, rng) for w in waves]
-    # The strips at 90 degrees are said to stand at 75 degrees.
+    # The strips at 90 degrees are entered as strips at 75 degrees: the residual is 0.07 to 0.08.
     wrong_wave = strips_wave(np.radians(75), THETA)
     other_measurements[3] = MetalStandard(measured=other_measurements[3].measured, wave=wrong_wave)
     assert estimate_leakage(other_measurements).residual > 0.02

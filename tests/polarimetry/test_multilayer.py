@@ -36,7 +36,7 @@ def reflect_by_tmm(eps, thickness_m, frequency_hz, theta):
 @settings(max_examples=60)
 @given(st.lists(st.tuples(media, thickness), max_size=4), media, frequency, angle)
 def test_random_stacks_agree_with_tmm(layers, last, f, theta):
-    """Three ways to the same coefficients: the host sums echoes, the simulator chains transmission lines."""
+    """`multilayer` sums echoes, the simulator chains transmission lines, and `tmm` multiplies transfer matrices."""
     eps = [e for e, _ in layers] + [last]
     thickness_m = [d for _, d in layers]
     expected, _ = reflect_by_tmm(eps, thickness_m, f, theta)
@@ -79,7 +79,7 @@ def test_a_passive_stack_reflects_at_most_all_power(layers, last, f, theta):
 @settings(max_examples=40)
 @given(media, media, frequency, angle)
 def test_a_stack_of_one_visible_medium_reflects_by_fresnel(eps, second, f, theta):
-    """The first medium is infinite, or the second is the same, or cannot be seen."""
+    """The first medium fills all of the space, the second one is of the same material, or the first one hides it."""
     for endless in (multilayer(eps, np.inf, f, theta), multilayer([eps], [], f, theta)):
         np.testing.assert_allclose(endless, fresnel(eps, theta), rtol=1e-12)
     np.testing.assert_allclose(multilayer([eps, eps], [1e-3], f, theta), fresnel(eps, theta), rtol=1e-9, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Reflection at layers against closed forms, and laws of energy."""
+"""Reflection coefficients of layers are compared with closed forms, and keep the laws of energy."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable
 FREQUENCY_HZ = 78e9
 # Cosines of the angle of incidence up to 87 degrees: nearer to grazing, formulas subtract nearly equal numbers.
 cosines = st.floats(0.05, 1.0)
-# From about that of foam to more than that of water at these frequencies; chosen.
+# From that of foam to more than that of water at these frequencies
 permittivities = st.builds(lambda real, loss: real - 1j * loss, st.floats(1.01, 20), st.floats(0, 20))
 
 
@@ -92,7 +92,7 @@ def test_metal_turns_both_polarisations_alike(cosine):
 
 def test_a_table_of_reflection_coefficients_agrees_with_the_solution_between_its_entries():
     stack = Stack(((4 - 0.4j, 0.003),), 2 - 0.1j)
-    # Chosen: a number of cosines that do not fall on the entries of the table.
+    # Cosines that do not fall on the entries of the table
     cosine = np.linspace(0.2, 1, 97)
     looked_up = np.array(ReflectionTable(stack, FREQUENCY_HZ).look_up(cosine))
     assert looked_up == pytest.approx(np.array(reflect(stack, FREQUENCY_HZ, cosine)), abs=1e-4)

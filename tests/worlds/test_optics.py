@@ -1,4 +1,4 @@
-"""Fields of facets against closed forms."""
+"""The echoes of surfaces that are divided into facets (physical optics) are compared with closed forms."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ S_AXIS = np.array([0.0, 1.0, 0.0])
 def make_antenna(position: np.ndarray, target: np.ndarray, *, p_share: float = 0.0) -> Antenna:
     """An antenna that looks at `target`, polarised along y (s) or, with `p_share` 1, in the plane of incidence (p).
 
-    Its amplitude falls with the cosine (exponent 1) of the angle from its boresight. The exponent is chosen: targets
-    are so small or so far away that it hardly matters.
+    Its amplitude falls with the cosine (exponent 1) of the angle from its boresight. Targets are so small or so far
+    away that the exponent hardly matters.
     """
     direction = (target - position) / np.linalg.norm(target - position)
     p_axis = np.cross(direction, S_AXIS)
@@ -55,8 +55,8 @@ def test_a_large_metal_plate_is_a_mirror(p_share):
     path_m = 2 * distance_m
     image = np.exp(-1j * K * path_m) / path_m
     # Metal reverses the field along its surface. In s that is the whole field. In p, the axes of TX and RX have the
-    # same part along the surface: what RX receives is reversed there, too. The limit is chosen; it covers the rest of
-    # the waves from the rims.
+    # same part along the surface: the field that RX receives is reversed in p, too. The waves from the rims leave 0.3
+    # per cent.
     assert np.mean(fields) == pytest.approx(-image, rel=0.04)
 
 
@@ -69,7 +69,7 @@ def test_a_small_plate_has_its_radar_cross_section():
     # Definition of the cross section: 4 pi distance^2 |received|^2 / |incident|^2, where the incident field of a
     # transmitter with 1 at 1 m is 1 / distance.
     section = 4 * np.pi * abs(received) ** 2 * distance_m**4
-    # Closed form: 4 pi area^2 / wavelength^2. The limit is chosen.
+    # Closed form: 4 pi area^2 / wavelength^2. They differ by 0.08 per cent.
     area_m2 = width_m**2
     assert section == pytest.approx(4 * np.pi * area_m2**2 / WAVELENGTH_M**2, rel=1e-3)
 
@@ -77,7 +77,7 @@ def test_a_small_plate_has_its_radar_cross_section():
 @pytest.mark.parametrize("angle_deg", [3.0, 7.0, 12.0])
 def test_a_plate_off_its_specular_direction_falls_as_a_sinc(angle_deg):
     width_m = 0.02
-    # Chosen: the far field begins at 0.4 m.
+    # Far beyond the beginning of the far field at 0.4 m
     distance_m = 80.0
     tx = make_antenna(np.array([0.0, 0, -distance_m]), np.zeros(3))
     angle = np.radians(angle_deg)
@@ -89,7 +89,7 @@ def test_a_plate_off_its_specular_direction_falls_as_a_sinc(angle_deg):
     # current lies along x and radiates with the cosine. The field is the mean of both.
     current_factor = (1 + np.cos(angle)) / 2
     on_axis = width_m**2 / WAVELENGTH_M / distance_m**2
-    # The limit is chosen.
+    # They differ by 0.04 per cent.
     assert received == pytest.approx(on_axis * phase_factor * current_factor, rel=2e-3)
 
 
@@ -110,7 +110,8 @@ def test_a_curved_body_reflects_by_geometrical_optics(radii_m):
         curvature_radius_m = half_axis_m**2 / depth_m
         focus_m = 1 / (1 / distance_m + 2 / curvature_radius_m)
         expected *= np.sqrt(focus_m / (focus_m + distance_m))
-    # Chosen: geometrical optics is the limit of short waves, and these bodies are only some 10 wavelengths large.
+    # Geometrical optics is the limit of short waves, and these bodies are only some 10 wavelengths large: they differ
+    # by up to 1.0 per cent.
     assert received == pytest.approx(expected, rel=0.03)
 
 
@@ -128,7 +129,7 @@ def test_a_cylinder_reflects_as_a_mirror_along_its_axis_and_as_a_sphere_across_i
     focus_m = 1 / (1 / distance_m + 2 / radius_m)
     across = np.sqrt(focus_m / (focus_m + distance_m))
     along = np.sqrt(1 / 2)
-    # Chosen: the ends of the cylinder add waves that are not in this formula.
+    # The ends of the cylinder add waves that are not in this formula: 8 per cent.
     assert received == pytest.approx(across * along / distance_m, rel=0.1)
 
 
@@ -144,7 +145,7 @@ def test_a_dielectric_plate_returns_s_and_p_as_fresnel_says(angle_deg):
         # Metal reflects with -1.
         coefficients.append(-dielectric / metal)
     expected = np.array(reflect(stack, FREQUENCY_HZ, np.cos(np.radians(angle_deg))))
-    # Chosen: a plate of 3 cm is lit from a small range of angles, and not from one.
+    # A plate of 3 cm is lit from a small range of angles, and not from one: the ratio is wrong by up to 0.1 per cent.
     assert coefficients[0] / coefficients[1] == pytest.approx(expected[0] / expected[1], rel=0.02)
     assert np.array(coefficients) == pytest.approx(expected, rel=0.02)
 
@@ -154,7 +155,7 @@ def test_metal_returns_both_polarisations_alike():
     for p_share in (0.0, 1.0):
         tx, rx = mirror_pair(55, 1.0, p_share=p_share)
         amplitudes.append(abs(scatter(tx, rx, make_square_plate(0.05, 0.0025), METAL, [FREQUENCY_HZ])[0, 0]))
-    # The limit is chosen.
+    # They differ by 0.05 per cent.
     assert amplitudes[0] == pytest.approx(amplitudes[1], rel=5e-3)
 
 
@@ -163,7 +164,7 @@ def test_antennas_may_change_places_near_the_specular_direction():
     facets = make_square_plate(0.05, 0.0025)
     layer = (4 - 0.4j, 0.003)
     stack = Stack((layer,), 2 - 0.1j)
-    # 0.87 m is about the distance of the published rig's antennas from the middle of its picture.
+    # The antennas of the published rig are about 0.87 m away from the middle of its picture.
     for _ in range(5):
         tx, rx = mirror_pair(55, 0.87, p_share=rng.uniform(0.2, 0.8))
         # RX is moved some 3 mm and has a narrower pattern than TX: the two directions do not agree by symmetry alone.
@@ -171,7 +172,8 @@ def test_antennas_may_change_places_near_the_specular_direction():
         moved_rx = Antenna(moved_position_m, rx.boresight, rx.polarisation, exponent=2.0)
         forth = scatter(tx, moved_rx, facets, stack, [FREQUENCY_HZ])[0, 0]
         back = scatter(moved_rx, tx, facets, stack, [FREQUENCY_HZ])[0, 0]
-        # Chosen: physical optics is reciprocal in the specular direction only, and nearly so beside it.
+        # Physical optics is reciprocal in the specular direction only, and nearly so in directions close to it: the
+        # difference is up to 0.7 per cent.
         assert abs(forth - back) < 0.03 * abs(forth)
 
 
@@ -186,7 +188,7 @@ def test_smaller_facets_change_nothing():
         scatter(tx, rx, make_square_plate(0.048, facet_m), METAL, [FREQUENCY_HZ])[0, 0]
         for facet_m in (0.004, 0.002, 0.001)
     )
-    # Chosen, above the differences measured: 0.3 and 0.06 per cent.
+    # The differences are 0.3 and 0.06 per cent.
     assert abs(coarse - fine) < 0.02 * abs(fine)
     assert abs(medium - fine) < 0.005 * abs(fine)
 

@@ -1,4 +1,7 @@
-"""Scenes of the worlds in the form that the surface estimator takes; simulated, no code shared with the estimator."""
+"""Simulated scans of solids, in the form that the surface estimator takes.
+
+The echoes are those of `polysight_worlds`, which shares no code with the estimator.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -11,10 +14,11 @@ from polysight_worlds.rig import published_boards
 from polysight_worlds.shape_scenes import ShapeNuisances, reference_sphere, scan_offsets, scan_shapes
 from polysight_worlds.shapes import Shape
 
-# Paths from TX over a point to RX within which specular points are searched: a mirror on the object plane has 1.7 m.
+# Specular points are searched where the path from TX over the point to RX is within these limits. A mirror on the
+# object plane has a path of 1.7 m.
 GATE_M = (1.5, 1.85)
-# Fewer than a scan's, for speed. Steps of 433 MHz: paths that differ by less than c / 433 MHz = 0.7 m are
-# distinguished.
+# Fewer frequencies than in a scan, for speed. With steps of 433 MHz, paths repeat every c / 433 MHz = 0.7 m, which is
+# wider than the limits above.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 9)
 
 # Positions of a scan, 2 mm apart: 158 x 110 mm, less than the published scan, for speed.
@@ -72,7 +76,10 @@ def see(optics) -> See:
 
 @pytest.fixture(scope="session")
 def metal(see):
-    """Points of the reference sphere: metal, radius 125 mm; its scan shows more directions than those of the tests."""
+    """Points of the reference sphere, metal with a radius of 125 mm.
+
+    Its scan is larger than those of the tests, so that it shows all directions that occur in them.
+    """
     return see([reference_sphere()], columns=COLUMNS + 10, rows=ROWS + 10)
 
 

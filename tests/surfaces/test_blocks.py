@@ -1,4 +1,4 @@
-"""Sums over correlated points: near points count together, far ones by themselves."""
+"""Sums of the errors of points that are correlated: near points are one block, and far ones are separate blocks."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def test_blocks_are_squares_of_the_stage():
     numbers = number_blocks(places, (0.0, 0.0), BLOCK_M)
     assert numbers[0] == numbers[1] == numbers[4]
     assert len({numbers[0], numbers[2], numbers[3]}) == 3
-    # Borders that are moved by half of a block
+    # The borders of the blocks are moved by half of a block along x.
     moved = number_blocks(places, (0.5, 0.0), BLOCK_M)
     assert moved[1] == moved[2]
     assert moved[0] != moved[1]

@@ -79,6 +79,7 @@ def test_ripple_is_estimated_though_overlapping_windows_share_it(bend):
     rng = np.random.default_rng(7)
     ripple = np.stack([draw_ripple(rng), draw_ripple(rng)])
     estimated = estimate_slope_std(make_echoes(bend, ripple, (1e-9, 1e-9)))
+    # Overlapping windows leave few independent ones of 60 x 60: the estimates are 2 % too small and 4 % too large.
     assert estimated == pytest.approx(SLOPE_STD, rel=0.07)
 
 
@@ -87,7 +88,8 @@ def test_noise_that_windows_account_for_is_not_a_ripple(bend):
     rng = np.random.default_rng(7)
     noise = np.stack([draw_noise(rng, 0), draw_noise(rng, 1)])
     estimated_over_reported = estimate_slope_std(make_echoes(bend, noise, SLOPE_STD)) / SLOPE_STD
-    # The variance of the ripple, 0 here, is estimated with some error; it is added where it is positive.
+    # The variance of the ripple, 0 here, is estimated with some error, and added where it is positive. This makes the
+    # estimates 13 % and 15 % larger than the reported errors.
     assert np.all((estimated_over_reported >= 1) & (estimated_over_reported < 1.35))
 
 
@@ -95,12 +97,14 @@ def test_noise_that_windows_account_for_is_not_a_ripple(bend):
 def test_ripple_of_a_straight_edge_is_estimated_though_the_curvature_takes_it(period_m):
     """The ripple is the same all along the edge. Across it, a period is nearly as long as the fit of the curvature.
 
-    The limits are chosen: a part of it cannot be distinguished from a curvature.
+    A part of the ripple cannot be distinguished from a curvature: 0.90 of it is found with a period of 80 mm, and 0.66
+    with 100 mm.
     """
     wave = np.sqrt(2) * np.cos(2 * np.pi * np.arange(SIDE) * STRIDE_M / period_m)
     ripple = np.stack([np.tile(wave, (SIDE, 1)), np.zeros((SIDE, SIDE))])
     estimated = estimate_slope_std(make_echoes(PLANE, ripple, (1e-9, 1e-9)))
-    assert 0.6 < estimated[0] / SLOPE_STD[0] < 1.3
+    share_found = estimated[0] / SLOPE_STD[0]
+    assert 0.6 < share_found < 1.3
 
 
 def test_a_curvature_that_changes_is_not_a_ripple():

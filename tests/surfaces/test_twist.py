@@ -1,4 +1,7 @@
-"""A surface that twists in the plane of incidence mixes s and p; compared with the exact series of a cylinder."""
+"""A surface that twists in the plane of incidence mixes the polarisations s and p.
+
+The estimator's formula is compared with the exact series of a cylinder.
+"""
 
 import numpy as np
 import pytest
@@ -11,8 +14,8 @@ from polysight_worlds.zones import spread_of_ray
 
 FREQUENCY_HZ = 78e9
 WAVE_NUMBER = 2 * np.pi * FREQUENCY_HZ / 299792458
-# Of the antennas. At a finite distance the series has one more term of 1 / (k distance), here 1e-4, which does not
-# depend on the curvature.
+# Distance of the antennas from the cylinder. At a finite distance the series has one more term of 1 / (k distance),
+# here 1e-4, which does not depend on the curvature.
 DISTANCE_M = 5.0
 
 
@@ -56,7 +59,7 @@ def test_a_twisted_surface_mixes_s_and_p_as_the_series_does(eps, angle_deg):
     twist = bent_along[0] * (bent_along @ ray_across) / radius_m
     permittivity = np.inf if eps is None else eps
     mixed = mix_twisted(permittivity, np.array([theta]), np.array([twist]), WAVE_NUMBER)[0]
-    # The limits are chosen.
+    # The formula is wrong by 1.5 % for dielectrics and by up to 3 % for metal. The mixed echoes are 2e-4 to 5e-3.
     assert mixed == pytest.approx(expected, rel=0.08)
     assert abs(expected) > 1e-4
 

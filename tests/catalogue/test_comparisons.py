@@ -1,4 +1,8 @@
-"""Two scans compared, on pixels and patches that are given: places, differences, errors, and what limits them."""
+"""Two scans are compared pixel by pixel and patch by patch.
+
+The pixels and patches are made by the tests. They have places, differences, errors of the differences, and notes about
+what limits the comparison.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -52,8 +56,7 @@ def test_a_difference_is_the_first_scan_minus_the_second():
     # All pixels differ by more than their errors, which are therefore not scaled down.
     assert comparison.figures.scatter == 1.0
     assert comparison.figures.significant_share == 1.0
-    # 3 x 4 pixels.
-    assert comparison.figures.compared == 12
+    assert comparison.figures.compared == 3 * 4
     assert comparison.figures.notes == []
 
 
@@ -124,7 +127,7 @@ def test_what_limits_a_comparison_is_a_note(changes, note):
 
 
 def test_scans_that_share_their_errors_are_compared_in_units_of_their_scatter():
-    """Errors that both scans share cancel in the difference: what is left is the scatter of unchanged pixels."""
+    """Errors that both scans share cancel in the difference: unchanged pixels scatter less than the stated errors."""
     comparison = compare(make_pixels(1.1), make_pixels(1.0))
     # All pixels differ by 0.1, less than unchanged pixels with independent errors would.
     scatter = 0.1 / DIFFERENCE_STD / UNCHANGED_MEDIAN
@@ -136,7 +139,9 @@ def test_scans_that_share_their_errors_are_compared_in_units_of_their_scatter():
 
 def test_errors_that_are_not_known_leave_a_comparison_without_significance():
     figures = compare(make_pixels(2.0, p_std=np.full((3, 4), np.nan)), make_pixels(1.0)).figures
-    assert (figures.significant_share, figures.scatter, figures.compared) == (None, None, 12)
+    assert figures.significant_share is None
+    assert figures.scatter is None
+    assert figures.compared == 3 * 4
 
 
 def make_patch(x_mm: float, y_mm: float, real: float = 3.0, imag: float = -0.5, **changes: Any) -> PatchFigures:
@@ -175,7 +180,7 @@ def test_a_difference_of_two_patches_has_the_errors_of_both():
     assert (compared.difference.real, compared.difference.imag) == (0.6, -0.4)
     assert compared.difference.real_std == round((2 * 0.09) ** 0.5, 4)
     assert compared.difference.imag_std == round((2 * 0.16) ** 0.5, 4)
-    assert compared.sigmas == round((0.6**2 / 0.18 + 0.4**2 / 0.32) ** 0.5, 2)
+    assert compared.sigmas == round((0.6**2 / (2 * 0.09) + 0.4**2 / (2 * 0.16)) ** 0.5, 2)
 
 
 @pytest.mark.parametrize("covariance", [None, [[0.0, 0.0], [0.0, 0.0]], [[float("nan"), 0.0], [0.0, 1.0]]])
@@ -184,9 +189,11 @@ def test_without_an_error_a_difference_of_two_patches_has_no_significance(covari
     exact = PermittivityFigures(real=3.0, imag=-0.5, covariance=[[0.0, 0.0], [0.0, 0.0]])
     (compared,) = pair_patches([make_patch(0.0, 0.0, permittivity=exact)], [make_patch(0.0, 0.0, permittivity=value)])
     assert (compared.difference.real, compared.difference.imag) == (0.6, -0.4)
-    assert (compared.difference.real_std, compared.sigmas) == (None, None)
+    assert compared.difference.real_std is None
+    assert compared.sigmas is None
     (compared,) = pair_patches([make_patch(0.0, 0.0, permittivity=None)], [make_patch(0.0, 0.0)])
-    assert (compared.difference, compared.sigmas) == (None, None)
+    assert compared.difference is None
+    assert compared.sigmas is None
 
 
 def test_colours_of_a_map_of_differences_reach_the_largest_ones():
@@ -196,7 +203,9 @@ def test_colours_of_a_map_of_differences_reach_the_largest_ones():
     comparison = replace(comparison, p=values, permittivity=values)
     for name, low, high in (("p", 0.0, abs(0.2 + 0.4j)), ("permittivity", -0.2, 0.2), ("loss", -0.4, 0.4)):
         picture = draw_comparison(comparison, name)
-        assert (picture.low, picture.high) == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=1e-3))
-    # A map without any difference has colours, too.
+        # Limits of colours are rounded to three digits.
+        assert picture.low == pytest.approx(low, abs=1e-3)
+        assert picture.high == pytest.approx(high, abs=1e-3)
+    # A map without any difference has a range of colours, too: up to 0.001.
     empty = replace(comparison, p=np.zeros((3, 4)))
     assert draw_comparison(empty, "p").high == pytest.approx(1e-3)

@@ -1,4 +1,4 @@
-"""Limits of the list of scans: names, depth, the index, logs of programs, notes."""
+"""Limits of the list of scans: names, depth of folders, age of files in the index, lengths of logs and notes."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,7 +62,7 @@ def test_a_name_has_only_parts_that_are_names(tmp_path, name):
         Scans(tmp_path).folder(name, new=True)
 
 
-def test_a_scan_to_be_made_need_not_be_there(tmp_path):
+def test_the_folder_of_a_new_scan_need_not_exist(tmp_path):
     make_scan(tmp_path, "a")
     assert Scans(tmp_path).folder("new", new=True) == tmp_path / "new"
     with expect_refusal(ErrorCode.FILE_MISSING, "does not exist"):
@@ -70,7 +70,7 @@ def test_a_scan_to_be_made_need_not_be_there(tmp_path):
     (tmp_path / "empty").mkdir()
     with expect_refusal(ErrorCode.FILE_MISSING, "nothing was recorded"):
         Scans(tmp_path).folder("empty")
-    # Nothing is made inside of a scan.
+    # No scan is made inside of another one.
     with expect_refusal(ErrorCode.FILE_MISSING, "inside the scan a"):
         Scans(tmp_path).folder("a/new", new=True)
     one_scan = Scans(tmp_path, only="later")
@@ -83,7 +83,7 @@ def test_a_scan_to_be_made_need_not_be_there(tmp_path):
     ("ages_s", "is_kept"), [((10.0, 10.0), True), ((2.5, 10.0), True), ((10.0, 1.5), False), ((-100.0, 10.0), False)]
 )
 def test_an_index_keeps_what_was_written_more_than_two_seconds_ago(tmp_path, monkeypatch, ages_s, is_kept):
-    """A scan has two files here. One that is younger, or of the future, may still change and keep its time."""
+    """A scan has two files here. A younger file, or one from the future, may change without a new time stamp."""
     # Any time of this century.
     now_ns = 1_800_000_000_000_000_000
     monkeypatch.setattr(scans_module, "time", SimpleNamespace(time=lambda: now_ns / 1e9))
@@ -137,7 +137,7 @@ def test_a_long_error_is_cut():
     log = f"polysight process: {'a' * 400}\n  why: {'b' * 600}\n  do: {'c' * 600}"
     finding = explain_failure(make_program(log))
     assert finding is not None
-    # Lengths that a page shows in a few lines (chosen).
+    # The page shows texts of these lengths in a few lines.
     assert (len(finding.what), len(finding.why), len(finding.do)) == (300, 500, 500)
     finding = explain_failure(make_program("d" * 400))
     assert finding is not None
@@ -154,15 +154,16 @@ def test_only_a_program_that_ended_with_an_error_has_failed(status, running, fai
 
 
 def test_of_a_log_the_last_16_kib_since_the_last_start_are_read(tmp_path):
-    """Colours of a terminal, other control characters and line ends of Windows are left out."""
+    """Colours of a terminal, other control characters and carriage returns are removed from it."""
     log = tmp_path / "scan.log"
     log.write_bytes(b"old\n--- started 1\nolder\n--- started 2\nfirst\r\n\x1b[1;31mred\x1b[0m\x07\n\tindented\n")
     assert read_log_tail(log) == "first\nred\n\tindented"
+    limit_bytes = 16 * 1024
     log.write_bytes(b"first" + b"." * 20_000 + b"last")
-    assert len(read_log_tail(log)) == 16384
+    assert len(read_log_tail(log)) == limit_bytes
     assert read_log_tail(log).endswith("..last")
-    log.write_bytes(b"a" * 16384)
-    assert read_log_tail(log) == "a" * 16384
+    log.write_bytes(b"a" * limit_bytes)
+    assert read_log_tail(log) == "a" * limit_bytes
     assert read_log_tail(tmp_path / "none") == ""
 
 
@@ -172,7 +173,7 @@ def test_a_scan_that_has_ended_needs_no_sign_of_life(tmp_path, state):
     assert add_signs_of_life(tmp_path, summary) == summary
 
 
-def test_a_scan_that_began_and_whose_program_failed_says_why(tmp_path):
+def test_a_scan_whose_program_failed_has_the_reason(tmp_path):
     folder = make_scan(tmp_path, "a")
     assert add_signs_of_life(folder, Summary("a", "begun")).state == "begun"
     # Linux numbers processes up to 2^22 - 1: no process has this number.

@@ -1,4 +1,4 @@
-"""One place of a scan, and two scans compared: the values are those of the images."""
+"""The values at one place of a scan, and the comparison of two scans, are those of the scans' images."""
 
 import io
 import os
@@ -27,14 +27,16 @@ def test_a_place_shows_its_own_pixel(processed_scans):
     row, column = pixels.nearest(*CENTRE)
     answer = probe(processed_scans / "one", *CENTRE)
     p = complex(pixels.p[row, column])
-    # Answers are rounded to four digits after the point, places to a hundredth of a mm.
+    # Answers are rounded to four digits after the point.
     assert answer.p.value == pytest.approx(p, abs=1e-4)
     map_of_scan = map_permittivity(read_products(processed_scans / "one"))
     assert answer.permittivity.value == pytest.approx(complex(map_of_scan.value[row, column]), abs=1e-4)
     assert answer.permittivity_real_std == pytest.approx(map_of_scan.real_std[row, column], abs=1e-4)
     assert answer.permittivity_loss_std == pytest.approx(map_of_scan.loss_std[row, column], abs=1e-4)
+    # Places are rounded to a hundredth of a mm.
     assert answer.place_mm == pytest.approx([pixels.x_mm[column], pixels.y_mm[row]], abs=0.01)
     assert answer.patch.truth.name == "PET"
+    # PET is among the nearest materials, within two standard deviations.
     assert any(near.name.startswith("PET") and near.sigmas < 2 for near in answer.nearest)
 
 
@@ -66,7 +68,7 @@ def test_the_range_profile_has_its_peak_at_the_plate(processed_scans):
         answer = probe(processed_scans / "one", *plate["centre_mm"]).profile
         for levels in answer.boards.values():
             peak_m = answer.path_m[int(np.argmax(levels))]
-            # Paths are relative to that of the place. Chosen: less than half of a range cell.
+            # Paths are relative to that of the place. The peak is less than half of a range cell away.
             assert abs(peak_m) < 0.03
 
 
@@ -86,8 +88,10 @@ def test_places_outside_the_image_are_refused(processed_scans):
 def test_without_a_result_no_material_is_reported(tmp_path):
     write_judged_products(tmp_path, "none", keep_withheld=True)
     answer = probe(tmp_path, 0.0, 0.0)
-    assert (answer.permittivity, answer.patch, answer.nearest) == (None, None, [])
-    # The images of H, V and P alone may be shown; "p_sigma" is an error of a result.
+    assert answer.permittivity is None
+    assert answer.patch is None
+    assert answer.nearest == []
+    # Only the images of H, V and P may be shown; "p_sigma" is the error of a result.
     maps_of_images = {name for name in MAPS if name[0] in "hvp" and name != "p_sigma"}
     assert {picture.name for picture in read_result(tmp_path).pictures} <= maps_of_images
 
@@ -103,9 +107,9 @@ def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed_scans)
     comparison = compare(processed_scans / "one", processed_scans / "two")
     sigmas_of_patches = [pair.sigmas for pair in comparison.figures.patches if pair.sigmas is not None]
     assert sigmas_of_patches
-    # Chosen: with so few patches none is three standard deviations apart by chance.
+    # With so few patches none differs by three standard deviations by chance.
     assert max(sigmas_of_patches) < 3
-    # Chosen: neighbouring pixels share their noise, so that a whole spot may differ by chance.
+    # Neighbouring pixels share their noise, so that a whole spot may differ by chance.
     assert (comparison.sigmas > 5).mean() < 0.05
     back = compare(processed_scans / "two", processed_scans / "one")
     finite_in_both = np.isfinite(comparison.p) & np.isfinite(back.p)
@@ -131,6 +135,7 @@ def test_a_changed_plate_is_found_where_it_lies(processed_scans, tmp_path):
     assert comparison.figures.scatter == least_scatter
     expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.images.p_sigma) / least_scatter
     assert np.allclose(sigmas[inside], expected[inside], rtol=1e-4)
+    # All pixels of the plate differ, and no other one.
     assert sigmas[inside].min() > 0.5
     sigmas[inside] = 0
     assert sigmas.max() == 0
@@ -152,12 +157,12 @@ def test_errors_that_both_scans_share_do_not_hide_a_change():
     # pixels widen the scatter a little.
     assert (sigmas[unchanged] > 2.448).mean() == pytest.approx(0.03, abs=0.025)
     assert (sigmas[changed] > SIGNIFICANT_STDS).mean() > 0.95
-    # Scatter that is larger than stated is left as it is, and none is known without numbers.
+    # Scatter that is larger than the stated errors is not reduced, and without numbers there is none.
     assert measure_scatter(3 * stated) == 1.0
     assert np.isnan(measure_scatter(np.array([np.nan])))
 
 
-def test_scans_that_cannot_be_compared_say_so(processed_scans, tmp_path):
+def test_a_scan_without_a_result_cannot_be_compared(processed_scans, tmp_path):
     write_judged_products(tmp_path / "none", "none")
     with expect_refusal(ErrorCode.NO_DATA):
         compare(processed_scans / "one", tmp_path / "none")

@@ -1,4 +1,4 @@
-"""The list of scans: its entries, their states, and that listing again reads almost nothing."""
+"""The list of scans has their states; what has not changed is not read again."""
 
 import json
 import os
@@ -24,7 +24,7 @@ from polysight_shared.errors import ConfigError, DataError
 
 @pytest.fixture
 def root(processed_scans: Path, tmp_path: Path) -> Path:
-    """A folder with a finished scan, one that was stopped, one whose program died, and products alone."""
+    """A folder with a finished scan, one that was stopped, one whose program died, and products without a scan."""
     for name in ("done", "week/stopped", "week/lost"):
         shutil.copytree(
             processed_scans / "one", tmp_path / name, ignore=shutil.ignore_patterns("raw", "samples", "figures")
@@ -49,22 +49,24 @@ def test_a_folder_that_cannot_be_looked_into_holds_no_scan(tmp_path, monkeypatch
 
 def test_every_scan_is_listed_with_its_state(root):
     summaries = {s.name: s for s in Scans(root).list()}
+    # State, recorded rows, and rows of the plan
     assert {n: (s.state, s.committed, s.rows) for n, s in summaries.items()} == {
         "done": ("finished", 17, 17), "week/stopped": ("stopped", 3, 17), "week/lost": ("lost", 5, 17),
         "out/one": ("products", 0, 0),
     }  # fmt: skip
-    assert (summaries["done"].simulated, summaries["done"].processed, summaries["out/one"].verdict) == (
-        True,
-        True,
-        "none",
-    )
+    assert summaries["done"].simulated
+    assert summaries["done"].processed
+    assert summaries["out/one"].verdict == "none"
 
 
 def test_images_without_materials_are_not_a_result(root):
     """Such folders are left by a killed `process`, or made by `polysight image`."""
     (root / "done" / "products" / "materials.json").unlink()
     summary = Scans(root).summary("done")
-    assert (summary.processed, summary.images_only, summary.verdict, summary.materials) == (False, True, "", ())
+    assert not summary.processed
+    assert summary.images_only
+    assert summary.verdict == ""
+    assert summary.materials == ()
 
 
 def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
@@ -136,7 +138,7 @@ def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
 
 
 def test_a_list_cut_off_by_its_time_limit_continues_at_the_next_request(root):
-    """The last name comes first, and entries that were read are kept; the index is written only for complete lists."""
+    """The last name is read first, and entries are kept; the index is written only for complete lists."""
     complete_list = Scans(root).list()
     last = max(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     index = root.parent / "index.json"
@@ -149,6 +151,7 @@ def test_a_list_cut_off_by_its_time_limit_continues_at_the_next_request(root):
         lists.append(scans.list(within_s=0.0))
         assert scans.unread < unread_before
         assert {s.name for s in lists[-2]} <= {s.name for s in lists[-1]}
+    # Each request reads at least one folder.
     assert len(lists) > 2
     assert lists[-1] == complete_list
     assert index.exists()
@@ -195,17 +198,18 @@ def test_another_thread_continues_only_where_one_makes_no_progress(root, monkeyp
     assert len(begun) == threads
 
 
-@pytest.mark.parametrize("kept", [0, 1, 0.5, 0.999])
-def test_a_damaged_or_foreign_index_changes_no_list(root, kept):
+# The share of the index file that is left; with 1, its version is changed.
+@pytest.mark.parametrize("kept_share", [0, 1, 0.5, 0.999])
+def test_a_damaged_or_foreign_index_changes_no_list(root, kept_share):
     index = root / ".polysight" / "list.json"
     backdate_files(root)
     listed = Scans(root, index=index).list()
     content = index.read_bytes()
     assert Scans(root, index=index).list() == listed
-    if kept == 1:
+    if kept_share == 1:
         index.write_bytes(content.replace(b'"version":1', b'"version":0').replace(b"finished", b"stopped"))
     else:
-        index.write_bytes(content[: int(kept * len(content))])
+        index.write_bytes(content[: int(kept_share * len(content))])
     second_list = Scans(root, index=index).list()
     assert second_list == listed
     assert index.read_bytes() == content
@@ -253,11 +257,11 @@ def test_links_hidden_folders_and_unprintable_names_are_not_followed(root, tmp_p
             Scans(root).folder(name)
 
 
-def test_one_scan_alone_is_shown_where_it_was_asked_for(root):
-    alone = Scans(root, "done")
-    assert [s.name for s in alone.list()] == ["done"]
+def test_a_list_that_is_limited_to_one_scan_has_no_other(root):
+    only_done = Scans(root, "done")
+    assert [s.name for s in only_done.list()] == ["done"]
     with pytest.raises(DataError):
-        alone.folder("week/stopped")
+        only_done.folder("week/stopped")
     assert Scans(root, "not-yet").folder("not-yet") == root / "not-yet"
 
 
@@ -291,7 +295,7 @@ def test_pipes_and_links_in_a_folder_keep_no_list_waiting(root, tmp_path_factory
     assert read_notes(root / "done").notes == "mine"
 
 
-def test_a_failure_is_the_last_error_in_the_log_or_that_it_was_killed():
+def test_a_failure_is_reported_by_the_last_error_in_the_log_or_as_killed():
     program = Program("process", running=False, status=None, words=(), started_utc="", log="")
     killed = explain_failure(program)
     assert killed is not None
@@ -311,7 +315,7 @@ def test_of_a_huge_record_and_status_only_the_beginning_is_read(tmp_path):
         path = tmp_path / PROGRAM_FOLDER / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(content)
-        os.truncate(path, 64 << 20)
+        os.truncate(path, 64 * 1024**2)
     tracemalloc.start()
     try:
         find_program(tmp_path, "scan")
@@ -319,4 +323,5 @@ def test_of_a_huge_record_and_status_only_the_beginning_is_read(tmp_path):
         _, peak_bytes = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert peak_bytes < 1 << 20
+    # A hundredth of the files
+    assert peak_bytes < 1024**2

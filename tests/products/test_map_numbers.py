@@ -1,4 +1,4 @@
-"""Numbers of maps and exports on small arrays: levels, ranges of colours, texts of ranges, names for MATLAB."""
+"""Levels, ranges of colours, texts of number ranges and names for MATLAB, as maps and exports have them."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_levels_are_decibels_of_amplitudes():
     levels = level_db(np.array([1.0, 10.0j, -0.1, 2.0, 0.0, np.nan, np.inf]))
     # 20 log10(2) = 6.0206.
     np.testing.assert_allclose(levels[:4], [0.0, 20.0, -20.0, 6.0206], atol=1e-4)
-    # Zero and values that are no numbers are all as dark as can be: far below any level of an image.
+    # Zero and values that are not finite have one level, far below any level of an image.
     assert len(set(levels[4:].tolist())) == 1
     assert levels[4] < -100
 
@@ -56,20 +56,22 @@ def test_without_patches_ratios_have_the_range_of_the_opaque_pixels():
     level[1900:] = 90.0
     opaque = np.arange(2001) < 1900
     low, high = _find_ratio_limits_db(level, opaque, [])
-    # Percentiles near the ends: the limits of this test leave a decibel or two (chosen).
+    # The range is that of percentiles near the ends of the levels, rounded to whole decibels.
     assert -6.0 <= low <= -4.0
     assert 12.0 <= high <= 15.0
 
 
-def test_without_opaque_pixels_ratios_have_some_range():
+def test_without_opaque_pixels_the_range_of_ratios_is_not_empty():
     low, high = _find_ratio_limits_db(np.full(10, 5.0), np.zeros(10, bool), [])
     assert low < high
 
 
-def test_patches_of_nearly_one_ratio_have_a_range_of_a_few_decibels():
+def test_patches_of_nearly_one_ratio_have_a_range_of_six_decibels():
+    """The colours cover six decibels at least, because noise must not look like a difference."""
     low, high = _find_ratio_limits_db(np.linspace(-5.0, 15.0, 10), np.ones(10, bool), [-40.0, -39.5])
+    # A decibel below the lowest patch, as above
     assert low == -41.0
-    assert -37.0 <= high < 0.0
+    assert high == low + 6.0
 
 
 @pytest.mark.parametrize(

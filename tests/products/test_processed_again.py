@@ -1,4 +1,4 @@
-"""Processing again: inputs are checked before anything is changed, and a failure leaves the old products."""
+"""A scan is processed again: inputs are checked before anything is changed, and a failure leaves the old products."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ SCENE = make_scene(
     step_mm=(14.0, 12.0),
     image={"columns": 40, "rows": 30, "pixel_mm": 4.0},
 )
-# The box on the copper plate: its middle and its size, mm. The leading minus does not make it an option.
+# The box on the copper plate: its middle and its size, mm. A value may begin with a minus sign.
 METAL = ["--metal", "-36,0,30,40"]
 # A box where nothing is.
 NO_METAL = ["--metal", "900,900,10,10"]
@@ -45,7 +45,7 @@ def recorded_scan(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def made_folder(recorded_scan, tmp_path) -> Path:
-    """A copy of both, in `scan` and `out`."""
+    """A copy of the scan and of its products, in `scan` and `out`."""
     return Path(shutil.copytree(recorded_scan, tmp_path / "lab"))
 
 
@@ -62,7 +62,7 @@ def write_boxes(made_folder: Path, labels: dict[str, list[float]]) -> Path:
     return made_folder / "mine.json"
 
 
-def test_labels_among_the_products_that_they_replace(made_folder):
+def test_a_label_file_may_lie_among_the_products_that_are_replaced(made_folder):
     """The file is read before its folder is replaced; its two boxes become the patches of the new products."""
     labels = made_folder / "out" / "labels.json"
     labels.write_text(json.dumps({"labels": {"metal": [7, 10, 12, 20], "drawn": [27, 10, 32, 20]}}))
@@ -130,7 +130,7 @@ def test_at_another_angle_than_the_librarys_nothing_is_named(made_folder, other_
     assert materials["model"] is None
     other_patch = next(s for s in materials["segments"] if not s["metal_reference"])
     assert other_patch["name"] is None
-    # Such a coarse scan may give no result: then the reason is there instead.
+    # Such a coarse scan may give no permittivity; then the patch has the reason.
     has_permittivity = other_patch["permittivity"] is not None
     is_refused = other_patch["refused"] is not None
     assert has_permittivity != is_refused

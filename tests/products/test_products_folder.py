@@ -41,7 +41,7 @@ def out(tmp_path) -> Path:
 
 @pytest.fixture(params=["one step", "two steps"])
 def exchange(request, monkeypatch):
-    """File systems with and without an atomic swap of two folders."""
+    """How two folders are swapped: in one atomic step, or in two on file systems without it."""
     if request.param == "two steps":
         monkeypatch.setattr(products_folder, "_exchange", lambda *_: False)
     return request.param
@@ -77,11 +77,11 @@ class Killed(BaseException):
 # An exchange has fewer than 20 steps: in the last cases nothing is killed.
 @pytest.mark.parametrize("step", range(20))
 def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, exchange, step, monkeypatch):
-    """With an atomic swap this holds at every moment; otherwise from the start of the next run."""
+    """With an atomic swap the folder holds old or new products at every moment, otherwise from the next run on."""
     steps_left = iter(range(step, -1, -1))
 
     def die_at_step(call):
-        """The call, which ends the program instead if the step is reached; then all further calls do, too."""
+        """The same function, which counts a step and ends the program if it is the last one, and after it."""
 
         def dying(*args, **kwargs):
             if next(steps_left, 0) == 0:

@@ -1,4 +1,7 @@
-"""The verdict `none` withholds results; signs of the errors of a permittivity; products of earlier releases."""
+"""A verdict of `none` withholds results in all exports.
+
+Errors of a loss have their sign, and products of earlier releases, which have no verdict, are read.
+"""
 
 import csv
 import json
@@ -74,7 +77,7 @@ def test_loss_is_minus_imag_in_the_covariance_too(tmp_path):
     spread = PermittivityFigures(real=3, imag=-1, covariance=covariance).spread
     assert spread is not None
     assert (spread.real_std, spread.loss_std, spread.covariance) == pytest.approx((0.2, 0.3, 0.01))
-    # The same from draws: a covariance of 200,000 is known to some per cent.
+    # The same from draws: a covariance of 200,000 draws is known to a per cent or so.
     draws = np.random.default_rng(1).multivariate_normal([3, -1], covariance, 200_000)
     real = draws[:, 0]
     loss = -draws[:, 1]

@@ -1,6 +1,7 @@
-"""Synthetic image pairs of plates: Fresnel, leakage, gains, band limit with ringing, uneven illumination, noise.
+"""Synthetic images of plates in H and V: reflection by Eq. 2 of the paper, a gain between the channels, a limited band
+with ringing at edges, uneven illumination and noise.
 
-Used only by these tests; the whole chain from raw data is tested elsewhere.
+They are made without raw data; `tests/process` tests the whole chain from raw data.
 """
 
 import functools
@@ -18,7 +19,7 @@ from polysight.materials.inversion import RigPrior
 # The paper's incidence angle.
 THETA = np.radians(55.0)
 # Nine plates with the permittivities eps' - j eps'' of the paper's Table 2; None is metal.
-NINE = {
+NINE_PLATES = {
     "rubber": 5.06 - 1.11j,
     "cardboard (rough)": 4.54 - 0.56j,
     "silicone rubber": 3.52 - 0.82j,
@@ -32,7 +33,7 @@ NINE = {
 
 
 @dataclass
-class Synthetic:
+class SyntheticScene:
     """An image pair, complex64 [ny, nx], with its axes and the plates in it."""
 
     h: np.ndarray
@@ -82,16 +83,16 @@ def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, thet
     pixels = 150
     pixel_mm = 2.0
     rng = np.random.default_rng(seed)
-    materials = NINE if materials is None else materials
+    materials = NINE_PLATES if materials is None else materials
     # Both axes of the image, millimetres from its middle.
     axis_mm = (np.arange(pixels) - (pixels - 1) / 2) * pixel_mm
 
     # Reflection of every point of the plane: 0 between the plates.
-    places = [((i % 3 - 1) * 60.0, (i // 3 - 1) * 60.0) for i in rng.permutation(9)]
+    raster_mm = [((i % 3 - 1) * 60.0, (i // 3 - 1) * 60.0) for i in rng.permutation(9)]
     r_s = np.zeros((pixels, pixels), complex)
     r_p = np.zeros((pixels, pixels), complex)
     plates = []
-    for (name, eps), (raster_x, raster_y) in zip(materials.items(), places, strict=False):
+    for (name, eps), (raster_x, raster_y) in zip(materials.items(), raster_mm, strict=False):
         centre_x = raster_x + rng.uniform(-5.0, 5.0)
         centre_y = raster_y + rng.uniform(-5.0, 5.0)
         half = 22.5
@@ -109,7 +110,8 @@ def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, thet
         parts = rng.standard_normal((2, pixels, pixels))
         white_noise = parts[0] + 1j * parts[1]
         noise_image = np.fft.ifft2(np.fft.fft2(white_noise) * passed)
-        noise_image *= noise * gain / np.sqrt(np.mean(abs(noise_image) ** 2)) if noise else 0.0
+        noise_rms = np.sqrt(np.mean(abs(noise_image) ** 2))
+        noise_image *= noise * gain / noise_rms
         ln_amplitude = smooth_field(rng, reflection.shape, 20)
         phase_rad = smooth_field(rng, reflection.shape, 20)
         illumination = np.exp(uneven * (ln_amplitude + 1j * phase_rad))
@@ -119,7 +121,8 @@ def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, thet
     # The distance of the plane is not known to a wavelength: a phase that both channels have in common.
     common_phase = np.complex64(np.exp(1j * rng.uniform(-3, 3)))
     axis_m = axis_mm / 1e3
-    return Synthetic(
+    # The middle of the image lies at x = -13.2 mm and y = 100 mm.
+    return SyntheticScene(
         h=images[0] * common_phase,
         v=images[1] * common_phase,
         x_m=axis_m - 0.0132,
@@ -139,7 +142,7 @@ def synthetic():
 def analyse_placement():
     """`analyse_placement(seed, angle_deg)`: the materials of a placement of the nine, analysed once.
 
-    Seeds 1000 to 1005 are those of `library`: tests without a library take them.
+    Tests that need no library take seeds 1000 to 1005, which are analysed for `library` anyway.
     """
 
     @functools.cache
@@ -162,7 +165,7 @@ def name_placement(library):
 
 @pytest.fixture(scope="session")
 def library(analyse_placement) -> Library:
-    """Six placements that differ from all test scenes."""
+    """A library of six placements, none of which is the scene of a test that uses the library."""
     return make_library(
         [TrainingScan(f"train-{s}", analyse_placement(s), True, {"made by": "test"}) for s in range(1000, 1006)],
         note="synthetic images",

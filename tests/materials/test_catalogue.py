@@ -59,8 +59,10 @@ def compute_debye_water(water_c: float, ghz: float) -> complex:
 
 
 def test_values_are_of_passive_dielectrics_at_millimetre_waves():
+    # Vacuum has eps' = 1, the densest material of the catalogue 13. Millimetre waves end at 300 GHz. `spread` is the
+    # relative standard deviation of eps' and of eps'' between specimens; the largest is 1.5.
     for material in materials.load_catalogue():
-        assert 1 < material.permittivity.real < 100, material
+        assert 1 < material.permittivity.real < 20, material
         assert material.permittivity.imag <= 0, material
         assert 10e9 <= material.frequency_hz <= 300e9, material
         assert all(0 < spread < 2 for spread in material.spread), material

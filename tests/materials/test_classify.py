@@ -73,7 +73,8 @@ def test_models_are_judged_for_each_angle_and_for_both_and_the_discriminant_is_u
     for fit in library.fit["angles"].values():
         assert fit["model"] == DISCRIMINANT_MODEL
         assert set(fit["judged"]) == set(MODELS)
-        # Mean difference of confidence and share of right names; the limit is chosen.
+        # Mean difference of confidence and share of right names. Four scans of four materials are 16 patches, of which
+        # a share has an error of up to sqrt(0.25 / 16) = 0.125. The largest difference is 0.15.
         assert 0 <= fit["calibration_error"] < 0.2
         assert fit["pixel_accuracy"] == fit["judged"][fit["model"]]["pixels"]
         assert "4 scans" in fit["split"]
@@ -92,7 +93,7 @@ def test_two_scans_are_enough_to_learn_from():
     errors = Errors(amplitude=0.003, phase_rad=0.005)
     drawn = draw(groups()["powders"].materials, 60.0, errors, seed=3, scans=2, pixels=6)
     library = fit_library(drawn.library())
-    # Four materials: chance is 0.25.
+    # Four materials: chance is 0.25. The pixel accuracy is 0.98.
     assert library.fit_for([60.0])["pixel_accuracy"] > 0.8
     # Patches are numbered like the materials.
     pixels = drawn.samples()
@@ -133,13 +134,15 @@ def test_patches_under_two_angles_are_named_together(two_angles, scans, model):
     assert len(matched) == 9
     library, _ = two_angles
     named = Classifier(library, model=model, angles_deg=ANGLES).scan([m.features for m in matched])
-    assert sum(n.patch_name.name == m.truth for n, m in zip(named, matched, strict=True)) >= 8
-    for n in named:
-        assert 0 < n.patch_name.confidence <= 1
-        assert sum(n.patch_name.votes.values()) == pytest.approx(1)
+    is_right = [patch.patch_name.name == match.truth for patch, match in zip(named, matched, strict=True)]
+    # The nearest neighbours name all nine right, the discriminant eight.
+    assert sum(is_right) >= 8
+    for patch in named:
+        assert 0 < patch.patch_name.confidence <= 1
+        assert sum(patch.patch_name.votes.values()) == pytest.approx(1)
 
 
-def test_patches_of_two_scans_are_paired_by_their_place_alone(scans):
+def test_patches_of_two_scans_are_paired_by_their_places_alone(scans):
     second_scan = scans[1]
     reordered = replace(second_scan, patches=second_scan.patches[::-1])
     assert [m.label for m in match_patches([scans[0], reordered])] == [m.label for m in match_patches(scans)]
@@ -170,7 +173,9 @@ def test_the_command_names_the_patches_of_two_scans(folders, capsys):
     assert answer["source"] == "simulated"
     assert answer["incidence_deg"] == pytest.approx(ANGLES)
     assert answer["model"] == DISCRIMINANT_MODEL
-    assert sum(p["name"] == p["truth"] for p in answer["patches"]) >= 8
+    # All of the nine patches but one, as above
+    is_right = [p["name"] == p["truth"] for p in answer["patches"]]
+    assert sum(is_right) >= 8
     assert main([*arguments, "--model", "knn"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("simulated: 9 patches at 55.0 and 60.0 degrees")
@@ -179,7 +184,7 @@ def test_the_command_names_the_patches_of_two_scans(folders, capsys):
 
 
 def test_patches_exchanged_between_two_angles_are_reported(folders, scans, capsys):
-    """The wood and the ceramic plate lie in each other's place in the second scan: no material fits both angles."""
+    """Wood and ceramic have exchanged their places before the second scan: no material fits both angles."""
     path = folders / "60" / PATCHES_FILE
     with np.load(path) as stored:
         content = dict(stored)

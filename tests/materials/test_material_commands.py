@@ -44,7 +44,8 @@ def test_the_command_judges_classifiers_by_scans_left_out_and_by_pixels_left_out
     answer = json.loads(capsys.readouterr().out)
     assert answer["source"] == "simulated"
     assert {s["split"] for s in answer["scores"]} == {"whole scans left out, 3 scans", "by pixel (optimistic)"}
-    assert all(s["pixels"] > 0.95 for s in answer["scores"])
+    # The materials differ by more than 20 standard deviations of a pixel: no name is wrong.
+    assert all(s["pixels"] == 1 for s in answer["scores"])
     assert np.shape(answer["confusion_of_best"]) == (2, 2)
     assert main(["classify", str(tmp_path / "two.npz")]) == 0
     out = capsys.readouterr().out

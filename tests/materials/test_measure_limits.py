@@ -1,4 +1,4 @@
-"""What makes a patch a flat plate, at each limit; scatter, relief and errors of drawn pixels."""
+"""The limits within which a patch counts as a flat plate, and the scatter, relief and errors of its pixels."""
 
 from typing import Any
 

@@ -120,16 +120,16 @@ def compute_layer_probability(plates: int, brightness_std: float) -> tuple[float
         r_s, r_p = multilayer([eps, 1.0], [rng.uniform(0.5e-3, 3e-3), np.inf], 78e9, ANGLES[0])
         t = complex(r_p / r_s)
         half_space = permittivity_from_ratio(t, ANGLES[0])
-        # Others are recognised by their ratio already.
+        # A ratio that no usual half space has shows the sheet without its brightness.
         if not (half_space.real > 1.3 and -3 < half_space.imag < 0):
             continue
-        # ln |H| of the sheet minus that of the half space
-        off_of_sheet = np.log(np.abs(r_s)) - np.log(np.abs(fresnel(half_space, ANGLES[0])[0]))
-        # Of the sheet, and of the half space
+        # Differences of ln |H| from that of the half space: of the sheet, and of the half space itself
+        r_s_of_half_space, _ = fresnel(half_space, ANGLES[0])
+        difference_of_sheet = np.log(np.abs(r_s)) - np.log(np.abs(r_s_of_half_space))
         layer_probabilities = []
-        for brightness_off in (off_of_sheet, 0.0):
-            measured_off = float(brightness_off + brightness_std * rng.standard_normal())
-            evidence = RatioEvidence(ANGLES[0], t, 0.01**2 * np.eye(2), 0.5, measured_off, brightness_std)
+        for true_difference in (difference_of_sheet, 0.0):
+            measured_difference = float(true_difference + brightness_std * rng.standard_normal())
+            evidence = RatioEvidence(ANGLES[0], t, 0.01**2 * np.eye(2), 0.5, measured_difference, brightness_std)
             layer_probabilities.append(weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet)
         probabilities.append(layer_probabilities)
     thin, thick = np.median(probabilities, axis=0)
@@ -138,28 +138,31 @@ def compute_layer_probability(plates: int, brightness_std: float) -> tuple[float
 
 def test_brightness_distinguishes_thin_plates_from_half_spaces_of_the_same_ratio():
     thin, thick = compute_layer_probability(60, brightness_std=0.05)
+    # A layer is the likelier explanation of most thin plates (the median is 0.71), and of hardly any half space.
     assert thin > 0.5
     assert thick < 0.05
 
 
 def test_brightness_of_unevenly_lit_plates_is_weak_evidence():
     thin, thick = compute_layer_probability(60, brightness_std=0.6)
+    # 0.16 and 0.14, compared with 0.71 and less than 0.05 of the test above
     assert abs(thin - thick) < 0.2
 
 
-def test_a_patch_that_may_be_a_layer_gets_no_permittivity_from_a_probability_of_a_fifth_on():
-    """With more than a fifth of layers among such patches less than 95 % of their regions would hold the truth.
+def test_a_patch_that_is_a_layer_with_more_than_a_fifth_of_probability_gets_no_permittivity():
+    """If more than a fifth of the patches with a permittivity were layers, the stated 95 % regions would hold the truth
+    less often than that.
 
-    The brightness decides: a patch with the same ratio and a half space's own brightness gets a permittivity.
+    Here all patches have the same ratio, and the brightness decides: that of a half space gives a permittivity.
     """
     eps = 3.0 - 0.03j
     r_s, r_p = multilayer([eps, 1.0], [0.9e-3, np.inf], 78e9, ANGLES[0])
     of_half_space = RatioEvidence(ANGLES[0], complex(r_p / r_s), 0.01**2 * np.eye(2), 0.5, 0.0, 0.05)
-    # ln |H| above that of a half space
-    brightness_offs = np.linspace(0.0, 0.4, 81)
-    evidences = [replace(of_half_space, brightness_off=float(off)) for off in brightness_offs]
+    # ln |H| minus that of a half space
+    brightness_differences = np.linspace(0.0, 0.4, 81)
+    evidences = [replace(of_half_space, brightness_off=float(difference)) for difference in brightness_differences]
     probability_of_layer = np.array([weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet for evidence in evidences])
-    # The cases lie on both sides of the limit.
+    # Some of the patches are far below the limit of a fifth, and some are a little above it.
     assert probability_of_layer[0] < 0.1
     assert np.any((probability_of_layer > 0.25) & (probability_of_layer < 0.5))
     assert [may_be_thin(evidence, AT_ANGLES[0]) for evidence in evidences] == (probability_of_layer > 0.2).tolist()
@@ -190,6 +193,7 @@ def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
         change_of_ratio = change_of_p - change_of_s
         change = np.array([change_of_s.real, change_of_ratio.real, change_of_ratio.imag])
         layered.append(float(np.mean(compute_layer_odds(make_dispersion(change), ANGLES[0]))))
+    # The odds of layers have a median of 1e17.
     assert np.median(layered) > 1e3
     # Half spaces show only the error of the measurement.
     errors = 0.01 * rng.standard_normal((100, 3))
@@ -201,7 +205,8 @@ def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
 def test_an_uncertain_change_over_the_sweep_is_not_evidence():
     for std in (30.0, 1e60):
         odds = compute_layer_odds(make_dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
-        assert np.median(odds) == pytest.approx(1, abs=0.05)
+        # Odds of 1 are no evidence; an error of 30 leaves 1 - 3e-5.
+        assert np.median(odds) == pytest.approx(1, abs=1e-3)
 
 
 def test_a_change_of_any_size_has_finite_odds():
@@ -222,6 +227,7 @@ def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
 
     constant = name_with_change(np.zeros(3))
     assert constant.name == "wood"
+    # 0.988; a ratio that is exactly that of wood leaves little to other materials.
     assert constant.confidence > 0.9
     assert name_with_change(np.array([0.2, -0.1, 0.3])).name == LAYER
 
@@ -230,10 +236,13 @@ def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
 @pytest.mark.parametrize("kind", ["dishes", "sheets"])
 def test_pieces_that_reflect_at_two_faces_get_no_name_of_the_library_and_no_wrong_permittivity(kind):
     pieces = judge_scene(kind, 1)
+    # Every name of the library is wrong here; one with a probability of at least 0.8 would mislead a user.
     assert not [p for p in pieces if p.source == "library" and p.confidence >= 0.8]
     # A sheet whose brightness happens to peak in the middle of the sweep looks like a half space.
-    assert sum(p.misled for p in pieces) <= 1
-    assert sum(p.thin or p.name == LAYER for p in pieces) >= 4
+    confidently_wrong = [p for p in pieces if p.misled]
+    assert len(confidently_wrong) <= 1
+    called_layers = [p for p in pieces if p.thin or p.name == LAYER]
+    assert len(called_layers) >= 4
 
 
 def test_each_reason_of_a_name_has_a_subject():
@@ -252,35 +261,46 @@ def test_a_likely_unknown_material_is_listed_as_a_rival(unknown, rival):
     assert reason.partition("; ")[2].removeprefix("it could also be ").startswith(rival)
 
 
-def test_beside_metal_that_may_be_painted_names_are_as_probable_as_in_both_cases_together():
-    """Rubber if the metal is bare, glass if it is painted; one broad error of t would contain other materials, too.
+def test_names_relative_to_metal_that_may_be_painted_have_the_mean_probability_of_both_cases():
+    """The patch is rubber if the metal is bare and glass if it is painted.
 
-    t is the ratio V / H relative to the metal: where that is painted, every t differs.
+    t is V / H relative to the metal; paint on the metal changes every t. One broad error of t that holds both cases
+    would hold other materials, too.
     """
     covariance = 0.004**2 * np.eye(2)
     bare, painted = (
         RatioEvidence(ANGLES[0], complex(inverse_ratio(LIBRARY[name], ANGLES[0])), covariance, 0.5)
         for name in ("rubber", "glass")
     )
-    cases = tuple(RatioCase(p, e.inverse_ratio, covariance) for p, e in ((0.4, painted), (0.6, bare)))
+    p_painted = 0.4
+    p_bare = 0.6
+    cases = (
+        RatioCase(p_painted, painted.inverse_ratio, covariance),
+        RatioCase(p_bare, bare.inverse_ratio, covariance),
+    )
     offset = painted.inverse_ratio - bare.inverse_ratio
-    shift = np.array([offset.real, offset.imag])
-    middle = bare.inverse_ratio + 0.4 * offset
-    # Mean and covariance of both cases together: t scatters by 0.4 * 0.6 of the squared distance between them, too.
-    spread = 0.4 * 0.6 * np.outer(shift, shift)
+    parts_of_offset = np.array([offset.real, offset.imag])
+    # Mean and covariance of both cases together: two values with these probabilities add the variance of a choice
+    # between them to that of each.
+    middle = bare.inverse_ratio + p_painted * offset
+    spread = p_painted * p_bare * np.outer(parts_of_offset, parts_of_offset)
     both = RatioEvidence(ANGLES[0], middle, covariance + spread, 0.5, cases=cases)
     pixels = np.full((20, 1), middle)
     as_bare, as_painted, as_both = (name_patch(AT_ANGLES[:1], [e], pixels).patch_name for e in (bare, painted, both))
     assert (as_bare.name, as_painted.name) == ("rubber", "glass")
     for name in LIBRARY:
-        expected = 0.6 * as_bare.probabilities.get(name, 0.0) + 0.4 * as_painted.probabilities.get(name, 0.0)
+        if_bare = as_bare.probabilities.get(name, 0.0)
+        if_painted = as_painted.probabilities.get(name, 0.0)
+        expected = p_bare * if_bare + p_painted * if_painted
+        # Probabilities below half a per cent are left out of the lists.
         assert as_both.probabilities.get(name, 0.0) == pytest.approx(expected, abs=0.005)
-    # Also together with a scan at another angle, beside bare metal.
+    # The same holds together with a scan at another angle, whose metal is bare.
     other_t = complex(inverse_ratio(LIBRARY["rubber"], ANGLES[1]))
     other_scan = RatioEvidence(ANGLES[1], other_t, covariance, 0.5)
     odds = weigh_kinds(AT_ANGLES, [both, other_scan])
-    parts = [weigh_kinds(AT_ANGLES, [e, other_scan]).kinds for e in (bare, painted)]
-    assert odds.kinds == pytest.approx(0.6 * parts[0] + 0.4 * parts[1])
+    odds_if_bare = weigh_kinds(AT_ANGLES, [bare, other_scan])
+    odds_if_painted = weigh_kinds(AT_ANGLES, [painted, other_scan])
+    assert odds.kinds == pytest.approx(p_bare * odds_if_bare.kinds + p_painted * odds_if_painted.kinds)
 
 
 def test_both_cases_of_metal_that_may_be_painted_move_to_the_angle_of_the_kinds():

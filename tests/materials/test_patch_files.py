@@ -1,4 +1,4 @@
-"""`patches.npz`: a scan that is named again later has the same errors as when it was first named."""
+"""`patches.npz` has all that names depend on: a scan that is named again from it gets the same names."""
 
 import io
 import json
@@ -67,7 +67,7 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(
     renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
     names_before = {r.patch.label: r.named.patch_name.name for r in plain.patches if r.named is not None}
     names_after = {label: patch_name.name for label, patch_name in renamed.items() if label in names_before}
-    # A patch may become unknown, but no other material; chosen: seven of ten keep their names.
+    # A patch may become unknown, but no other material. Here all eight keep their names; two may become unknown.
     for label, name in names_after.items():
         assert name in (names_before[label], UNKNOWN)
     kept = [label for label, name in names_after.items() if name == names_before[label]]

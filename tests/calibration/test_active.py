@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-from tests.support.calibration import SOURCES, filter_file, make_metal_reference
+from tests.support.calibration import SOURCES, make_filter_file, make_metal_reference
 from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
@@ -34,7 +34,7 @@ from polysight_shared.tables import to_builtins
 @pytest.fixture
 def hpf(tmp_path):
     """The path of a calibration file of the high-pass filters."""
-    return write_calibration(filter_file(), tmp_path / "c")
+    return write_calibration(make_filter_file(), tmp_path / "c")
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def create_scan(folder, rig) -> ScanFolder:
 
 def test_a_filter_measured_with_other_corners_or_not_on_every_receiver_is_refused(make_rig, tmp_path):
     # Measured with corners of 175 and 350 kHz
-    complete = filter_file()
+    complete = make_filter_file()
     without_rv = msgspec.structs.replace(complete, boards={"RH": complete.boards["RH"]})
     cases = [
         # File, first corner of the rig file, and what the message names
@@ -73,7 +73,7 @@ def test_a_filter_measured_with_other_corners_or_not_on_every_receiver_is_refuse
 
 
 def test_a_file_is_read_back_as_it_was_written_and_replaces_no_other(tmp_path):
-    file = filter_file()
+    file = make_filter_file()
     paths = [write_calibration(file, tmp_path / "new") for _ in range(3)]
     assert len(set(paths)) == 3
     assert all(read_calibration(path, FilterFile, "hpf") == file for path in paths)
@@ -96,7 +96,7 @@ def test_a_file_of_another_kind_format_or_content_is_refused(hpf):
 
 
 def test_relative_paths_are_relative_to_the_rig_file(tmp_path, make_rig):
-    path = write_calibration(filter_file(), tmp_path / "sub" / "calibration")
+    path = write_calibration(make_filter_file(), tmp_path / "sub" / "calibration")
     table = to_builtins(make_rig()) | {"calibration": {"hpf": f"calibration/{path.name}"}}
     (tmp_path / "sub" / "rig.toml").write_text(tomli_w.dumps(table))
     rig = load_instrument(tmp_path / "sub" / "rig.toml")
@@ -157,7 +157,7 @@ def test_a_changed_or_missing_copy_is_refused(tmp_path, rig_naming, hpf):
 
 def test_the_calibration_of_an_existing_scan_is_not_overwritten(tmp_path, rig_naming, hpf):
     scan = create_scan(tmp_path / "scan", rig_naming(hpf=hpf))
-    other_file = write_calibration(filter_file(first_khz=200.0), hpf.parent)
+    other_file = write_calibration(make_filter_file(first_khz=200.0), hpf.parent)
     copy_into_scan(rig_naming(hpf=other_file), scan.path, simulated=True)
     assert load_scan_calibration(scan).high_pass("RH").corners_hz[0] == 180.5e3
 
@@ -192,6 +192,6 @@ def test_simulated_calibration_is_refused_for_a_measured_scan(tmp_path, rig_nami
     with expect_refusal(ErrorCode.MISMATCH, hpf):
         copy_into_scan(rig_naming(hpf=hpf), tmp_path / "scan", simulated=False)
     measured_sweep = SourceScan("sweep", "scans/sweep", False, 7)
-    measured = msgspec.structs.replace(filter_file(), sources=[measured_sweep])
+    measured = msgspec.structs.replace(make_filter_file(), sources=[measured_sweep])
     rig = rig_naming(hpf=write_calibration(measured, hpf.parent))
     assert set(copy_into_scan(rig, tmp_path / "scan", simulated=False)) == {"hpf"}

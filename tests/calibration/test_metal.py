@@ -5,7 +5,7 @@ import shutil
 import msgspec
 import numpy as np
 import pytest
-from tests.support.calibration import SOURCES, filter_file, make_metal_reference
+from tests.support.calibration import SOURCES, make_filter_file, make_metal_reference
 from tests.support.refusals import expect_refusal
 
 from polysight.calibration.files import load_calibration, load_checked_calibration, write_calibration, write_metal
@@ -103,7 +103,7 @@ def test_settings_that_cancel_may_change(metal, make_rig, change):
 
 def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_rig):
     def make_rig_with_filter(corner_khz):
-        file = write_calibration(filter_file(corner_khz), metal.parent)
+        file = write_calibration(make_filter_file(corner_khz), metal.parent)
         return make_rig(calibration={"metal": str(metal), "hpf": str(file)})
 
     # The plate was imaged with 175 kHz, as the rig file says.

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import tomli_w
-from tests.support.calibration import filter_file
+from tests.support.calibration import make_filter_file
 from tests.support.doctor.case import QUICK, RIG, make_context
 from tests.support.rigs import make_programmed_rig
 
@@ -65,7 +65,7 @@ def run_check_by_name(context, name):
 
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
-    path = write_calibration(filter_file(), tmp_path)
+    path = write_calibration(make_filter_file(), tmp_path)
     context = make_context(make_programmed_rig(calibration={"hpf": str(path)}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
     assert check_calibration(dataclasses.replace(context, hello=hello)).level == "ok"

@@ -8,7 +8,7 @@ import json
 import time
 
 import pytest
-from tests.support.calibration import filter_file, read_board_filter
+from tests.support.calibration import make_board_filter, make_filter_file
 from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answer_as_pi
 from tests.support.processes import wait_for
@@ -143,8 +143,8 @@ def test_a_scan_in_progress_is_not_disturbed(live):
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
-    # RH has the corners of `filter_file`, 180.5 and 355.25 kHz.
-    filters = filter_file(rv=read_board_filter(first_khz=172.5, second_khz=347.0))
+    # RH has the corners of `make_filter_file`, 180.5 and 355.25 kHz.
+    filters = make_filter_file(rv=make_board_filter(first_khz=172.5, second_khz=347.0))
     path = write_calibration(filters, live.folder / "calibration")
 
     def shorten_scan(table):

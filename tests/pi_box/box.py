@@ -1,4 +1,8 @@
-"""A Raspberry Pi 3B on QEMU: its power switch, ssh, its USB socket, and its GPIO registers seen from outside."""
+"""A Raspberry Pi 3B emulated by QEMU.
+
+Tests switch its power off and on, run commands over ssh, plug and unplug the stage's USB cable, and read its GPIO
+registers from outside.
+"""
 
 import json
 import re
@@ -24,6 +28,7 @@ SELECT = 0x00
 SET = 0x1C
 CLEAR = 0x28
 LEVEL = 0x34
+REGISTER_BYTES = 4
 # Only hanging programs reach these limits: a busy computer once needed 5 minutes to boot.
 BOOT_LIMIT_S = 3600.0
 COMMAND_LIMIT_S = 1800.0
@@ -32,11 +37,13 @@ KERNEL_LINE += " systemd.default_timeout_start_sec=3600"
 
 
 class Write(NamedTuple):
-    """A value written to a register that sets or clears GPIO lines 0 to 31; its time is that of this computer."""
+    """A write of the Pi to the register that sets GPIO lines 0 to 31, or to the one that clears them."""
 
+    # Time of this computer's clock, not of the Pi's
     t_s: float
+    # True: the lines are set
     high: bool
-    # Bit n stands for line n.
+    # Bit n is line n.
     lines: int
 
 
@@ -48,7 +55,7 @@ def free_port() -> int:
 
 
 class Monitor:
-    """QEMU's monitor (QMP)."""
+    """Connection to QEMU's monitor, which controls the emulated machine (QMP, the QEMU Machine Protocol)."""
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
@@ -58,8 +65,9 @@ class Monitor:
         self.do("qmp_capabilities")
 
     def do(self, command: str, **arguments: Any) -> Any:
-        """Execute a command and return its result."""
+        """Execute a command of QEMU's monitor and return its result."""
         self._socket.sendall(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
+        # Events may come before the reply.
         while True:
             reply = json.loads(self._lines.readline())
             if "event" not in reply:
@@ -72,16 +80,16 @@ class Monitor:
 
 
 class Box:
-    """A Pi that has been switched on; data on its card is lost when it is deleted.
+    """An emulated Pi, which is switched on when the object is made. Changes of its SD card are lost at its end.
 
     Parameters
     ----------
     image
-        Folder that build_root.sh has printed.
+        Folder with the Pi's file system and kernel, which build_root.sh makes; it prints the path.
     work
-        Folder for its log and its sockets; its path must be short.
+        Folder for logs and sockets. Its path must be short: the name of a socket has at most 107 bytes.
     stage
-        Serial port (of this computer) of the stage.
+        Serial port of the stage on this computer.
     """
 
     def __init__(self, image: Path, work: Path, stage: Path) -> None:
@@ -96,11 +104,13 @@ class Box:
         forwards = "".join(f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for inner, outer in forward.items())
         command = ["qemu-system-aarch64", "-M", "raspi3b", "-display", "none", "-msg", "timestamp=on"]
         command += ["-kernel", str(image / "vmlinuz"), "-initrd", str(image / "initrd"), "-dtb", str(image / "pi.dtb")]
-        # Neither a Pi nor this box has a battery for its clock: a Pi asks the network, the box is told the time.
+        # A Pi has no battery for its clock and asks the network for the time. This one gets it from its kernel's
+        # command line.
         clock = f"systemd.clock_usec={time.time_ns() // 1000}"
         command += ["-append", f"{KERNEL_LINE} {clock}", "-serial", f"file:{self.console}", "-D", str(self._trace)]
         command += ["-drive", f"if=sd,format=raw,snapshot=on,file={image / 'root.img'}"]
-        # Restricted: only the forwarded ports connect in or out; packages of a release are on the card.
+        # Its network is restricted: only the forwarded ports connect to it, and it reaches nothing outside. The
+        # packages that a release needs are on the card.
         command += ["-netdev", f"user,id=net,restrict=on{forwards}", "-device", "usb-net,netdev=net"]
         command += ["-qmp", f"unix:{work / 'qmp'},server=on,wait=off"]
         command += ["-chardev", f"serial,id=stage,path={stage}"]
@@ -139,7 +149,7 @@ class Box:
         return time.monotonic() - begun
 
     def wait(self, condition: Callable[[], bool], what: str, limit_s: float = COMMAND_LIMIT_S) -> None:
-        """Return when the condition holds; fail after the limit, or when the machine has ended."""
+        """Return when the condition (described by `what`) holds; fail after the limit, or if QEMU has ended."""
         deadline = time.monotonic() + limit_s
         while not condition():
             if self._process.poll() is not None or time.monotonic() > deadline:
@@ -169,31 +179,37 @@ class Box:
         self._authorize_stage(1)
 
     def unplug(self) -> None:
-        """Unplug it: the device disappears for the Pi's kernel. QEMU's own `device_del` crashes its USB controller."""
+        """Unplug the stage's USB cable: the Pi's kernel no longer authorises the device, so that it disappears.
+
+        QEMU could remove the device, but its command `device_del` crashes the USB controller.
+        """
         self._authorize_stage(0)
 
     def _authorize_stage(self, value: int) -> None:
+        """Write 1 (authorised) or 0 to the file in which Linux has this setting of a USB device."""
         find = f"grep -l {FTDI} /sys/bus/usb/devices/*/idVendor"
         self.run(f"echo {value} | sudo tee $(dirname $({find}))/authorized >/dev/null")
 
     def register(self, offset: int) -> int:
-        """A register of the GPIO block, read without the Pi's processor."""
+        """Read a register of the GPIO block from QEMU, without a program on the Pi."""
         command = {"command-line": f"xp /1wx {GPIO_BASE + offset:#x}"}
         answer = self.monitor.do("human-monitor-command", **command)
         return int(answer.split(":")[1], 16)
 
     def function(self, line: int) -> int:
-        """Function of a line: 0 input, 1 output. A register has three bits for each of ten lines."""
-        register = self.register(SELECT + 4 * (line // 10))
-        return register >> 3 * (line % 10) & 7
+        """Function of a line: 0 is input, 1 is output. A register has three bits for each of ten lines."""
+        register = self.register(SELECT + REGISTER_BYTES * (line // 10))
+        shift = 3 * (line % 10)
+        return (register >> shift) & 0b111
 
     def level(self, line: int) -> int:
-        """The level of a line. A register has one bit for each of 32 lines."""
-        register = self.register(LEVEL + 4 * (line // 32))
-        return register >> line % 32 & 1
+        """Level of a line, 0 or 1. A register has one bit for each of 32 lines."""
+        register = self.register(LEVEL + REGISTER_BYTES * (line // 32))
+        shift = line % 32
+        return (register >> shift) & 1
 
     def writes_during(self, action: Callable[[], Any]) -> list[Write]:
-        """Record the writes to the registers that set and clear lines during the block."""
+        """Call a function; return the writes to the registers that set and clear lines until it returns."""
         size = self._trace.stat().st_size
         self.monitor.do("trace-event-set-state", name=MEMORY_WRITE, enable=True)
         try:
@@ -205,24 +221,25 @@ class Box:
             text = trace.read().decode(errors="replace")
         pattern = re.compile(rf"@([\d.]+):{MEMORY_WRITE} .*addr 0x(\w+) value 0x(\w+) size 4 name 'bcm2835_gpio'")
         writes = []
-        for t, address, value in pattern.findall(text):
+        for time_text, address, value in pattern.findall(text):
             offset = int(address, 16) & 0xFF
             if offset in (SET, CLEAR):
-                writes.append(Write(float(t), offset == SET, int(value, 16)))
+                writes.append(Write(t_s=float(time_text), high=offset == SET, lines=int(value, 16)))
         return writes
 
     def cut_power(self) -> None:
-        """Switch the power off and on: data that was not on the card is lost. Returns when a login is possible."""
+        """Switch the power off and on, and return when a login is possible. Data not yet on the SD card is lost."""
         self.monitor.do("system_reset")
-        self._hang_up()
+        self._close_ssh()
         self.boot_s = self._boot()
 
-    def _hang_up(self) -> None:
+    def _close_ssh(self) -> None:
+        """End the connection that all ssh commands share."""
         subprocess.run(["ssh", "-F", str(self.ssh_config), "-O", "exit", "box"], capture_output=True, check=False)
 
     def close(self) -> None:
-        """Pull the plug."""
-        self._hang_up()
+        """Switch the power off for good: end QEMU."""
+        self._close_ssh()
         self.monitor.close()
         self._process.kill()
         self._process.wait()

@@ -12,8 +12,8 @@ from polysight_shared.config import Instrument
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 
 
-def read_board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardFilter:
-    """One receiver's corners, measured with those of the published rig."""
+def make_board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardFilter:
+    """A measurement of one receiver's high-pass filters, by default near the corners of the published rig."""
     return BoardFilter(
         corners_khz=[first_khz, second_khz],
         standard_error_khz=[1.5, 2.5],
@@ -25,26 +25,41 @@ def read_board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> B
     )
 
 
-def filter_file(first_khz: float = 180.5, rv: BoardFilter | None = None) -> FilterFile:
-    """Both receivers with the same corners, or the second one with its own."""
-    rh = read_board_filter(first_khz)
-    return FilterFile(**make_header("hpf", SOURCES), boards={"RH": rh, "RV": rv or rh})
+def make_filter_file(first_khz: float = 180.5, rv: BoardFilter | None = None) -> FilterFile:
+    """A file with the filters of both receivers, which are the same unless `rv` is given."""
+    rh = make_board_filter(first_khz)
+    if rv is None:
+        rv = rh
+    return FilterFile(**make_header("hpf", SOURCES), boards={"RH": rh, "RV": rv})
 
 
 def make_metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
-    """The images of a noisy plate, made with this rig."""
+    """A metal reference from the images of a plate, with a gain that varies over the plate and noise of 2 %."""
     rng = np.random.default_rng(seed)
     grid = image_grid(rig)
     y, x = np.meshgrid(np.linspace(0, 1, grid.y_m.size), np.linspace(0, 1, grid.x_m.size), indexing="ij")
     gain = (1 + 0.2 * y) * np.exp(1j * x)
     noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))
-    plate_seen = Images(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, np.ones(x.shape, bool))
-    plate = plane_reference(plate_seen, smooth_mm=4.0, name="plate")
+    images = Images(
+        h=gain * noise[0], v=0.7 * noise[1], x_m=grid.x_m, y_m=grid.y_m, valid=np.ones(x.shape, bool)
+    )  # fmt: skip
+    plate = plane_reference(images, smooth_mm=4.0, name="plate")
     return replace(plate, made_with=ImagedWith.from_rig(rig, {}))
 
 
 def compute_remaining(estimate: Leakage, truth: Leakage) -> tuple[float, float]:
-    """Return the larger cross-polar amplitude and the co-polar ratio's deviation from 1, after correction."""
+    """What remains of the true leakage after a correction with its estimate.
+
+    Returns
+    -------
+    crosstalk, imbalance
+        The larger of the two relative amplitudes of the wrong polarisation, and the deviation of the ratio of both
+        channels' gains from 1. Both are 0 for a perfect estimate.
+    """
+    # A matrix maps the true H and V to the received ones: a perfect correction leaves a diagonal of equal gains.
     residual = np.linalg.solve(estimate.matrix(), truth.matrix())
-    crosstalk = max(abs(residual[0, 1] / residual[0, 0]), abs(residual[1, 0] / residual[1, 1]))
-    return float(crosstalk), float(abs(residual[0, 0] / residual[1, 1] - 1))
+    gain_h = residual[0, 0]
+    gain_v = residual[1, 1]
+    crosstalk = max(abs(residual[0, 1] / gain_h), abs(residual[1, 0] / gain_v))
+    imbalance = abs(gain_h / gain_v - 1)
+    return float(crosstalk), float(imbalance)

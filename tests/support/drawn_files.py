@@ -1,6 +1,7 @@
-"""Write `labels/` and `materials/` files of the published data set with known truth.
+"""Write files as in the folders `labels` and `materials` of the paper's published data, with known materials.
 
-Their images and pixels are random, not simulated scans: Fresnel reflection of each box with speckle and phase errors.
+Their images and pixels are no simulated scans: each pixel is drawn from the Fresnel reflection of its material, with
+random errors of amplitude and phase.
 """
 
 import json
@@ -16,14 +17,17 @@ from numpy.typing import NDArray
 from polysight_simulators.scene.optics import half_space
 
 Complex = NDArray[np.complexfloating]
-# Pixels of each side of an image.
-PIXELS = 150
+# Width and height of an image in pixels
+IMAGE_PIXELS = 150
+# Name of the metal reference
 METAL = "copper"
+# Amplitude of an image outside of the boxes; that of metal is 1.
+BACKGROUND = 0.001
 
 
 @dataclass(frozen=True)
 class Material:
-    """A material of drawn files; without permittivity it is metal."""
+    """A material; without a permittivity it is metal."""
 
     name: str
     permittivity: complex | None
@@ -39,9 +43,10 @@ class Material:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of a drawn pixel: relative amplitude and phase (rad); half of the variance is common to a box.
+    """Errors of drawn pixels: standard deviations of the relative amplitude and of the phase, and the leakage.
 
-    `leakage` is the amplitude of p in H and of s in V.
+    Half of a variance is that of an error which all pixels of a box share. `leakage` is the amplitude of r_p in H and
+    of r_s in V.
     """
 
     amplitude: float = 0.009
@@ -49,21 +54,27 @@ class Errors:
     leakage: float = 0.0
 
 
+def draw_gain(rng: np.random.Generator) -> complex:
+    """Draw the gain of a channel, which is the same for all pixels: an amplitude of 0.5 to 2 and any phase."""
+    amplitude = rng.uniform(0.5, 2.0)
+    return amplitude * np.exp(2j * np.pi * rng.uniform())
+
+
 def draw_pixels(
     material: Material, angle_deg: float, n: int, errors: Errors, rng: np.random.Generator
 ) -> tuple[Complex, Complex]:
-    """Draw H and V of n pixels of a box, complex64 [n], with unit gain."""
+    """Draw H and V of n pixels of a box with a gain of 1, complex64 [n]."""
     r_s, r_p = material.reflection(angle_deg)
 
     def draw_error(std: float) -> NDArray[np.floating]:
-        """Draw errors of which half of the variance is common to the pixels."""
+        """Draw an error that all pixels share plus one for each pixel, both with half of the variance."""
         return std * np.sqrt(0.5) * (rng.standard_normal() + rng.standard_normal(n))
 
     channels = []
     for signal in (r_s + errors.leakage * r_p, r_p + errors.leakage * r_s):
         amplitude_error = draw_error(errors.amplitude)
         phase_error = draw_error(errors.phase_rad)
-        # The published images are conjugate to a reflection with losses of -j eps''.
+        # The published images are the complex conjugates of what a permittivity eps' - j eps'' gives.
         drawn = np.conj(signal * (1 + amplitude_error) * np.exp(1j * phase_error))
         channels.append(drawn.astype(np.complex64))
     return channels[0], channels[1]
@@ -72,10 +83,14 @@ def draw_pixels(
 def write_material(
     folder: Path, material: Material, angle_deg: float, scan: str, pixels: int, errors: Errors, seed: int
 ) -> Path:
-    """Write `folder`/<name>_<angle>.pkl with its own metal reference; further files are numbered."""
+    """Write pixels of a material and of its metal reference into `folder`/<name>_<angle>.pkl; return its path.
+
+    If that file exists, a number is added to the name.
+    """
     rng = np.random.default_rng(seed)
-    gain_h = rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform())
-    gain_v = rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform())
+    gain_h = draw_gain(rng)
+    gain_v = draw_gain(rng)
+    # P, H and V of the material and of the metal
     values = []
     for medium in (material, Material(METAL, None)):
         h, v = draw_pixels(medium, angle_deg, pixels, errors, rng)
@@ -94,12 +109,12 @@ def write_material(
         "simulated": True,
     }
     folder.mkdir(parents=True, exist_ok=True)
-    safe = "".join(c if c.isalnum() or c in "-." else "-" for c in material.name).strip("-")
-    path = folder / f"{safe}_{angle_deg:.0f}.pkl"
-    for number in range(2, 1000):
-        if not path.exists():
-            break
-        path = folder / f"{safe}_{angle_deg:.0f}_{number}.pkl"
+    file_name = "".join(c if c.isalnum() or c in "-." else "-" for c in material.name).strip("-")
+    path = folder / f"{file_name}_{angle_deg:.0f}.pkl"
+    number = 1
+    while path.exists():
+        number += 1
+        path = folder / f"{file_name}_{angle_deg:.0f}_{number}.pkl"
     path.write_bytes(pickle.dumps(content))
     return path
 
@@ -121,28 +136,33 @@ def write_labels(
     folder, scan
         Output folder, and name of the scan.
     boxes, materials
-        Name to pixel corners [x0, y0, x1, y1] (half-open), and name to material.
+        Corners of each box in pixels by its name, [x0, y0, x1, y1] without x1 and y1 themselves; and its material.
     angle_deg, errors, seed
         Incidence angle, errors, and their seed.
     upside_down
-        The images' rows run opposite to the boxes' y.
+        The first row of an image is that with the largest y.
     """
     rng = np.random.default_rng(seed)
     path = folder / scan
     path.mkdir(parents=True)
-    images = [
-        0.001 * (rng.standard_normal((PIXELS, PIXELS)) + 1j * rng.standard_normal((PIXELS, PIXELS))) for _ in "hv"
-    ]
-    gains = [rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform()) for _ in "hv"]
-    # A phase common to both channels: the scene is tilted by a tenth of a degree.
-    distance = np.exp(2j * np.pi * np.add.outer(*2 * [np.arange(PIXELS) / 900.0]))
+    shape = (IMAGE_PIXELS, IMAGE_PIXELS)
+    images = [BACKGROUND * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) for _ in "hv"]
+    gains = [draw_gain(rng) for _ in "hv"]
+    # A phase that both channels share, of one turn in 900 pixels along each axis: the scene is tilted by a tenth of a
+    # degree.
+    turns = np.arange(IMAGE_PIXELS) / 900.0
+    tilt = np.exp(2j * np.pi * np.add.outer(turns, turns))
     for name, (x0, y0, x1, y1) in boxes.items():
-        h, v = draw_pixels(materials[name], angle_deg, (x1 - x0) * (y1 - y0), errors, rng)
+        width = x1 - x0
+        height = y1 - y0
+        h, v = draw_pixels(materials[name], angle_deg, width * height, errors, rng)
         for image, pixels in zip(images, (h, v), strict=True):
-            image[y0:y1, x0:x1] += pixels.reshape(y1 - y0, x1 - x0)
+            image[y0:y1, x0:x1] += pixels.reshape(height, width)
     for key, image, gain in zip(("sar_h", "sar_v"), images, gains, strict=True):
-        full_image = (gain * image * distance).astype(np.complex64)
-        np.save(path / f"{key}.npy", full_image[::-1] if upside_down else full_image)
+        full_image = (gain * image * tilt).astype(np.complex64)
+        if upside_down:
+            full_image = full_image[::-1]
+        np.save(path / f"{key}.npy", full_image)
     content = {
         "description": f"simulated: {scan}, incidence {angle_deg:.0f} deg",
         "labels": {name: list(box) for name, box in boxes.items()},
@@ -153,15 +173,15 @@ def write_labels(
 
 
 def _sar_config() -> dict[str, Any]:
-    """Return the keys of the published files."""
+    """Return the settings of a scan with the keys of the published files; the pixels are 2 mm wide."""
     focus = {"alignment_configs": {}, "sar_focuse_center": [0.0, 0.0, 0.0]}
     return {
         "numX": 350,
         "numY": 200,
         "dx": 2,
         "dy": 2,
-        "output_size_x": 2 * PIXELS,
-        "output_size_y": 2 * PIXELS,
+        "output_size_x": 2 * IMAGE_PIXELS,
+        "output_size_y": 2 * IMAGE_PIXELS,
         "chirp_configs": [],
         "ant_locs": {},
         "tx_idx": 1,

@@ -1,7 +1,8 @@
-"""Figures that change only on purpose: a file beside a test keeps them, and the test compares.
+"""Numbers that must not change without notice: a JSON file in the test's folder keeps them, and the test compares.
 
-They are not a truth, and do not show what is right: laws do that. They show changes that no law mentions. To
-accept new ones, remove the file, run the test, which writes it again and fails once, and read the difference.
+Kept numbers are those of an earlier run, and may be wrong; other tests check what is right. They reveal changes that no
+other test notices. To accept new numbers, remove the file and run the test: it writes the file again and fails once.
+Then read the difference in git.
 """
 
 from __future__ import annotations
@@ -20,16 +21,22 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+# Values that a file keeps, each with its path in nested containers.
 Kept = float | int | str | bool | None
+# A number in a text that is no part of a name, date, time, version or path
 NUMBER = re.compile(r"(?<![\w.#])[-+\N{MINUS SIGN}]?\d+(?:\.\d+)?(?![\w]*[-:/]\d)")
 # Relative difference that counts as rounding. Measured: without compiled loops and vector units, votes of single pixels
 # changed by 2 %, everything else by less than 1 %.
-RELATIVE = 0.03
+RELATIVE_TOLERANCE = 0.03
+# From this number of lines on, those of a picture are described together.
 MANY_LINES = 40
 
 
 def assert_kept(file: Path, figures: object, absolute: float = 1e-5) -> None:
-    """Compare all numbers, names and truths in nested figures with those that a file keeps."""
+    """Compare all values in nested containers with those that a file keeps.
+
+    Numbers may differ by RELATIVE_TOLERANCE, or by `absolute`.
+    """
     new = dict(flatten(figures))
     if not file.exists():
         file.parent.mkdir(exist_ok=True)
@@ -38,21 +45,22 @@ def assert_kept(file: Path, figures: object, absolute: float = 1e-5) -> None:
         pytest.fail(f"{file} was written: read it, and run the test again")
     kept_values = json.loads(file.read_text(encoding="utf-8"))
     assert sorted(new) == sorted(kept_values)
-    different = {
-        n: (value, kept_values[n]) for n, value in new.items() if not are_alike(value, kept_values[n], absolute)
-    }
+    different = {}
+    for name, value in new.items():
+        if not are_equal_but_for_rounding(value, kept_values[name], absolute):
+            different[name] = (value, kept_values[name])
     assert different == {}
 
 
-def are_alike(new: Kept, kept: Kept, absolute: float) -> bool:
-    """True for equal values, and for numbers whose difference may be rounding."""
+def are_equal_but_for_rounding(new: Kept, kept: Kept, absolute: float) -> bool:
+    """True for equal values, and for numbers that differ by no more than the tolerances."""
     if isinstance(new, float) and isinstance(kept, float | int):
-        return math.isclose(new, kept, rel_tol=RELATIVE, abs_tol=absolute)
+        return math.isclose(new, kept, rel_tol=RELATIVE_TOLERANCE, abs_tol=absolute)
     return new == kept
 
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Kept]]:
-    """Yield the path and value of everything in nested containers; numbers have five digits."""
+    """Yield the path and the value of every element of nested containers; real numbers are rounded to five digits."""
     if isinstance(value, Mapping):
         for key, part in value.items():
             yield from flatten(part, f"{name}.{key}" if name else str(key))
@@ -73,24 +81,29 @@ def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Kept]]:
         yield name, value
 
 
-def summarise_array(values: np.ndarray, places: int = 7) -> dict[str, Any]:
-    """Return the shape, the mean size and some values of an array, from the same places each time."""
+def summarise_array(values: np.ndarray, samples: int = 7) -> dict[str, Any]:
+    """Return the shape of an array, the mean magnitude of its elements, and some evenly spaced elements."""
     flat = values.ravel()
     if values.dtype == bool:
         return {"shape": list(values.shape), "true": int(flat.sum())}
-    usable = flat[np.isfinite(flat)]
-    chosen = usable[np.linspace(0.1 * usable.size, 0.9 * usable.size, places).astype(int)] if usable.size else usable
-    size = np.abs(usable.astype(complex))
+    finite = flat[np.isfinite(flat)]
+    if finite.size:
+        # Elements near the ends are often margins of an image.
+        indices = np.linspace(0.1 * finite.size, 0.9 * finite.size, samples).astype(int)
+        mean_magnitude = float(np.abs(finite.astype(complex)).mean())
+    else:
+        indices = np.array([], dtype=int)
+        mean_magnitude = 0.0
     return {
         "shape": list(values.shape),
-        "finite": int(usable.size),
-        "size": float(size.mean()) if size.size else 0.0,
-        "values": [v.item() for v in chosen],
+        "finite": int(finite.size),
+        "size": mean_magnitude,
+        "values": [element.item() for element in finite[indices]],
     }
 
 
 def find_numbers(text: str) -> list[float]:
-    """Return the numbers in a text, without those of dates, times, versions and names."""
+    """Return the numbers in a text, without those in dates, times, versions and names."""
     return [float(n.replace("\N{MINUS SIGN}", "-")) for n in NUMBER.findall(text)]
 
 
@@ -117,7 +130,7 @@ def collect_figures() -> Iterator[list[Figure]]:
 
 
 def describe_figures(saved: Sequence[Figure]) -> list[dict[str, Any]]:
-    """What stands where in figures: sizes, axes, and all that is drawn in coordinates of the data."""
+    """Return for each figure its size, and for each of its axes the position, the limits and what is drawn in it."""
     return [
         {"size_in": figure.get_size_inches().tolist(), "axes": [_describe_axes(ax) for ax in figure.axes]}
         for figure in saved
@@ -128,32 +141,45 @@ def _describe_axes(ax: Any) -> dict[str, Any]:
     return {
         "place": list(ax.get_position().bounds),
         "limits": [*ax.get_xlim(), *ax.get_ylim()],
-        "texts": [[*_place(text), text.get_fontsize(), find_numbers(text.get_text())] for text in ax.texts],
+        "texts": [_describe_text(text) for text in ax.texts],
         "lines": _describe_lines([np.column_stack(line.get_data()) for line in ax.lines]),
-        "patches": [_spread(patch.get_path().vertices @ _data_matrix(patch)) for patch in ax.patches],
-        "points": [[c.get_alpha(), *c.get_clim(), *_spread(np.asarray(c.get_offsets()))] for c in ax.collections],
+        "patches": [_compute_mean_and_std(_list_corners(patch)) for patch in ax.patches],
+        "points": [_describe_points(collection) for collection in ax.collections],
         "images": [[*image.get_extent(), *image.get_clim(), *image.get_size()] for image in ax.images],
     }
 
 
+def _describe_text(text: Any) -> list[Any]:
+    """Position, size of the font, and numbers in the text."""
+    x, y = text.get_position()
+    return [float(x), float(y), text.get_fontsize(), find_numbers(text.get_text())]
+
+
+def _describe_points(collection: Any) -> list[Any]:
+    """Opacity, range of the colours, and where the points are."""
+    return [
+        collection.get_alpha(),
+        *collection.get_clim(),
+        *_compute_mean_and_std(np.asarray(collection.get_offsets())),
+    ]
+
+
 def _describe_lines(lines: list[np.ndarray]) -> list[list[float]]:
-    """Describe each line by its number of points, their mean and spread; very many lines, such as normals, together."""
+    """Number of points of each line and where they are; very many lines, such as surface normals, are one."""
     if len(lines) > MANY_LINES:
         lines = [np.concatenate(lines)]
-    return [[len(points), *_spread(points)] for points in lines]
+    return [[len(points), *_compute_mean_and_std(points)] for points in lines]
 
 
-def _place(text: Any) -> list[float]:
-    return [float(c) for c in text.get_position()]
+def _list_corners(patch: Any) -> np.ndarray:
+    """Corners of a patch relative to its first one. The path of a rectangle is the unit square, without its size."""
+    width = patch.get_width() if hasattr(patch, "get_width") else 1.0
+    height = patch.get_height() if hasattr(patch, "get_height") else 1.0
+    return patch.get_path().vertices @ np.diag([width, height])
 
 
-def _data_matrix(patch: Any) -> np.ndarray:
-    """Return the size of a patch relative to its path: the path of a rectangle is the unit square."""
-    return np.diag([getattr(patch, "get_width", lambda: 1.0)(), getattr(patch, "get_height", lambda: 1.0)()])
-
-
-def _spread(points: Any) -> list[float]:
-    """Return mean and standard deviation along each axis."""
+def _compute_mean_and_std(points: Any) -> list[float]:
+    """Return mean and standard deviation along each axis; an empty list without finite coordinates."""
     points = np.asarray(points, dtype=float)
     if not points.size or not np.isfinite(points).any():
         return []

@@ -1,10 +1,11 @@
-"""Run a program of the instrument that kills itself (SIGKILL) at one exact file operation.
+"""Run a program of the instrument that kills itself (SIGKILL) at one given file operation.
 
     python killed_at.py HITS OPERATION:SUFFIX:NTH,... polysight scan --out DIR
 
-At the NTH `OPERATION` (pwrite, fsync, rename, ftruncate) on a file whose name ends in SUFFIX the process is killed:
-before the operation, but within a write. Random kills would hardly ever hit these moments. Every such operation adds
-its line OPERATION:SUFFIX to the file HITS; with NTH 0 nothing else happens.
+The process kills itself before the NTH `OPERATION` (fsync, rename or ftruncate) on a file whose name ends in SUFFIX. A
+write (pwrite) first writes half of its bytes. A kill at a random time would hardly ever hit these moments. With 0 for
+NTH the process is not killed. Every such operation adds the line OPERATION:SUFFIX to the file HITS, so that a test can
+count them.
 """
 
 import os
@@ -15,28 +16,28 @@ from typing import Any
 
 
 def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
-    """Have this process killed at the `nth` `operation` of `os` on a file whose name ends in `suffix` (0: never)."""
+    """Replace a function of `os` by one that kills this process at its `nth` call for a file with this suffix."""
     function = getattr(os, operation)
-    hits_left = nth
+    calls = 0
 
-    def count_and_call(what: Any, *more: Any, **named: Any) -> Any:
-        nonlocal hits_left
-        # The first argument is a descriptor, except for a rename, whose second one is the new name.
-        if isinstance(what, int):
-            name = str(Path(f"/proc/self/fd/{what}").readlink())
+    def count_and_call(first_argument: Any, *more: Any, **named: Any) -> Any:
+        nonlocal calls
+        # The first argument is a descriptor; that of a rename is the old name, and the second one is the new name.
+        if isinstance(first_argument, int):
+            name = str(Path(f"/proc/self/fd/{first_argument}").readlink())
         else:
             name = str(more[0])
         if name.endswith(suffix):
             with hits.open("a", encoding="utf-8") as f:
                 f.write(f"{operation}:{suffix}\n")
-            hits_left -= 1
-            if not hits_left:
-                # Half of the data is written.
+            calls += 1
+            if calls == nth:
                 if operation == "pwrite":
                     data, offset = more
-                    function(what, bytes(data)[: len(data) // 2], offset)
+                    first_half = bytes(data)[: len(data) // 2]
+                    function(first_argument, first_half, offset)
                 os.kill(os.getpid(), signal.SIGKILL)
-        return function(what, *more, **named)
+        return function(first_argument, *more, **named)
 
     setattr(os, operation, count_and_call)
 

@@ -1,4 +1,7 @@
-"""A small scan of six plates whose words or cubes are changed while they are read."""
+"""A small scan of six plates, whose recorded samples are changed while they are read: the radar had a fault.
+
+A scan is read from raw rows (int16 words of I and Q), or from cubes of synchronised samples.
+"""
 
 from __future__ import annotations
 
@@ -27,16 +30,20 @@ SCENE: dict[str, Any] = {
     "grid": {"columns": 43, "rows": 41, "step_x_mm": 10.0, "step_y_mm": 6.0},
     "plates": [
         {"name": "metal", "centre_mm": [0.0, -34.0], "size_mm": [46.0, 46.0], "metal": True},
-        *({"name": n, "centre_mm": at, "size_mm": [46.0, 46.0], "permittivity": e} for n, (at, e) in PLATES.items()),
+        *(
+            {"name": name, "centre_mm": centre_mm, "size_mm": [46.0, 46.0], "permittivity": permittivity}
+            for name, (centre_mm, permittivity) in PLATES.items()
+        ),
     ],
 }  # fmt: skip
 ROWS = SCENE["grid"]["rows"]
-# Changes the words of a row in place: board, row, int16 [chirp, sample, 2, rx].
+# A function that changes the samples of a row in place. Its arguments are the board, the row, and the samples: int16
+# [chirp, sample, I or Q, RX] of raw rows, complex [chirp, sample, 1, RX] of cubes.
 Mangle = Callable[[str, int, np.ndarray], None]
 
 
 class Mangled:
-    """A source whose words or cubes are changed while they are read."""
+    """A source of rows, whose samples `mangle` changes while they are read."""
 
     def __init__(self, source: Any, mangle: Mangle) -> None:
         self._source = source
@@ -49,10 +56,12 @@ class Mangled:
         recorded = self._source.read_row(board, row)
         if isinstance(recorded, CubeRow):
             cube = recorded.cube.copy()
-            self._mangle(board, row, cube.transpose(1, 2, 0)[:, :, None])
+            # [RX, chirp, sample] as a view [chirp, sample, 1, RX]
+            view = cube.transpose(1, 2, 0)[:, :, None]
+            self._mangle(board, row, view)
             return replace(recorded, cube=cube)
-        chirp = self.instrument.chirp
-        words = recorded.payload.copy().view(np.int16).reshape(-1, chirp.samples, 2, 4)
+        samples = self.instrument.chirp.samples
+        words = recorded.payload.copy().view(np.int16).reshape(-1, samples, 2, 4)
         self._mangle(board, row, words)
         return replace(recorded, pieces=split_pieces(words.reshape(-1).view(np.uint8)))
 
@@ -78,22 +87,22 @@ ProcessMangled = Callable[..., tuple[Pipeline, Images, Findings]]
 
 
 def make_processor(source: Source) -> ProcessMangled:
-    """Return a function that processes the scan, with its words changed by `mangle`, or another source `of`.
+    """Return a function that processes this source or another one (`of`), with its samples changed by `mangle`.
 
-    It returns pipeline, images and findings. A scan without changes is processed once.
+    It returns pipeline, images and findings. A source without changes is processed only once.
     """
     processed: dict[Any, tuple[Pipeline, Images, Findings]] = {}
 
-    def make(mangle: Mangle | None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
-        pipeline = make_pipeline(Mangled(of, mangle) if mangle else of)  # type: ignore[arg-type]
+    def process(source: Any) -> tuple[Pipeline, Images, Findings]:
+        pipeline = make_pipeline(source)
         images = pipeline.form_images()
         return pipeline, images, pipeline.examine(images)
 
     def process_once(mangle: Mangle | None = None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
         if mangle is not None:
-            return make(mangle, of)
+            return process(Mangled(of, mangle))
         if of not in processed:
-            processed[of] = make(None, of)
+            processed[of] = process(of)
         return processed[of]
 
     return process_once

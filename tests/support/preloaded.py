@@ -1,14 +1,14 @@
-"""Start our programs as forks of a process that has imported them: an import takes longer than most programs.
+"""Start our programs as forks of a process that has imported their modules, because the import takes most of the time.
 
-`install` replaces `subprocess.Popen` in the process that runs the tests. Commands of ours are sent to the server, a
-child process with all our modules loaded, no thread and no socket. The program is a fork of it: a real process with its
-own arguments, environment, folder, files, and signals. Every other command, and one whose environment changes how
-Python starts, is started as always.
+`install` replaces `subprocess.Popen` in the process that runs the tests. It sends our commands to a server: a child
+process with all our modules loaded, without threads and sockets. The program is a fork of the server, and a real
+process with its own arguments, environment, folder, files and signals. Other commands are started as usual, and so are
+ours if their environment changes how Python starts.
 
-The program is the child of the process that asked, as if that had started it: the server forks twice, the middle one
-ends, and the asking process adopts its orphans meanwhile. Exit status, `getppid` and signals at a parent's end work. So
-each program that starts others itself has a server of its own, forked before the program begins. So are the workers of
-pytest-xdist: they fork their programs from the same server, and import nothing of ours again.
+The program is a child of the process that called `Popen`, as if that process had started it itself. For that, the
+server forks twice, the process between them ends, and the calling process adopts the orphan. So exit status, `getppid`
+and the signal at a parent's end work as usual. A program that starts others gets a server of its own, forked before the
+program begins. Workers of pytest-xdist are started in the same way, and import none of our modules again.
 """
 
 from __future__ import annotations
@@ -41,42 +41,45 @@ from execnet.gateway_io import popen_bootstrapline
 REPO = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
 PACKAGES = ("polysight_shared", "polysight_pi", "polysight_simulators", "polysight", "polysight_papers")
-# Loaded by functions of ours, when they are called.
+# Libraries that our modules import only when a function needs them.
 LIBRARIES = (
     "h5py", "jinja2", "matplotlib.backends.backend_agg", "matplotlib.figure", "matplotlib.image", "numpy.testing",
     "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.stats", "skimage.measure",
     "sklearn.discriminant_analysis", "sklearn.model_selection", "sklearn.neighbors", "uvicorn", "xarray",
 )  # fmt: skip
-# Name for a worker of pytest-xdist, which execnet starts by `python -u -c CODE`.
+# Name of a worker of pytest-xdist, which execnet starts by `python -u -c CODE`
 WORKER = "worker"
-# Runs a program of ours: `python killed_at.py HITS PLACES polysight scan ...`.
+# A script that runs one of our programs: `python killed_at.py HITS OPERATIONS polysight scan ...`
 KILLED_AT = str(Path(__file__).with_name("killed_at.py"))
-# Programs that start other programs of ours, and commands of `polysight` that do.
+# Programs that start other programs of ours, and commands of `polysight` that do
 STARTING_OTHERS = ("polysight_simulators.rig", "polysight_simulators", WORKER)
 COMMANDS_STARTING_OTHERS = frozenset({"demo", "doctor", "process", "resume", "scan", "serve"})
-# Variables that affect only a new process.
+# Beginnings of the names of environment variables that have an effect only when a process starts
 READ_AT_START = ("PYTHON", "LD_", "LC_", "LANG", "OMP_", "OPENBLAS_", "MPL", "MALLOC_")
-# Descriptors below this number are the program's own; above are copies of those that are passed to it.
+# Numbers of file descriptors below this one are free for the program. Descriptors that are passed to the program are
+# copied to numbers from this one on, until all others are closed.
 FIRST_SPARE = 700
-# Length of the server's own command line, over which a program's arguments are written.
-ROOM_FOR_WORDS = 8000
+# Length of the server's own command line: a program's arguments are written over it, and are cut if they are longer.
+COMMAND_LINE_BYTES = 8000
 # <linux/prctl.h>
 PR_SET_CHILD_SUBREAPER = 36
 
 
 class Request(NamedTuple):
-    """A program to start. Its files come along, as the descriptors of these numbers."""
+    """A program to start. Its open files are sent with the request."""
 
     words: list[str]
     environment: dict[str, str]
     folder: str
+    # Numbers that the sent files get in the program, in their order.
     descriptors: list[int]
     new_session: bool
+    # `preexec_fn` of Popen
     prepare: Callable[[], object] | None
 
 
 def program_name(words: list[str]) -> str:
-    """The module or script of a command of ours, WORKER, or an empty string."""
+    """The module or script of one of our commands, or WORKER; "" for any other command."""
     program = Path(words[0])
     if program.parent != BIN:
         return ""
@@ -93,7 +96,10 @@ def program_name(words: list[str]) -> str:
 
 
 def may_start_others(words: list[str]) -> bool:
-    """True for a program that may start others of ours, and gets a server; a fork takes as long as a short command."""
+    """True for a program that may start other programs of ours, so that it needs a server.
+
+    Other programs get none, because one more fork takes as long as a short command.
+    """
     name = program_name(words)
     is_command = name == KILLED_AT or name == "polysight"
     return name in STARTING_OTHERS or (is_command and not COMMANDS_STARTING_OTHERS.isdisjoint(words))
@@ -105,17 +111,17 @@ def is_ours(function: Callable[[], object] | None) -> bool:
 
 
 def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables that only a new process takes notice of."""
+    """Return the environment variables that have an effect only when a process starts."""
     return {name: value for name, value in environment.items() if name.startswith(READ_AT_START)}
 
 
 class Popen(subprocess.Popen):
-    """`subprocess.Popen` that has commands of ours forked."""
+    """`subprocess.Popen` that lets a server fork our commands."""
 
     server: Server
 
     def _execute_child(self, *values: Any, **named: Any) -> None:
-        """Start the program: as a fork if it is a plain command of ours, else as `subprocess` does."""
+        """Start the program: as a fork if it is a plain command of ours, otherwise as `subprocess` does."""
         start = super()._execute_child  # type: ignore[misc]
         bound_arguments = inspect.signature(start).bind(*values, **named).arguments
         if isinstance(bound_arguments["args"], str | bytes | os.PathLike):
@@ -129,9 +135,16 @@ class Popen(subprocess.Popen):
             and bound_arguments["executable"] is None
             and bound_arguments["process_group"] == -1
         )
-        same_python = read_at_start(environment) == read_at_start(os.environ)
-        forked = words and program_name(words) and is_plain and same_python and is_ours(bound_arguments["preexec_fn"])
-        if not forked or not Path(folder).is_dir():
+        is_our_command = bool(words) and program_name(words) != ""
+        starts_alike = read_at_start(environment) == read_at_start(os.environ)
+        can_be_forked = (
+            is_our_command
+            and is_plain
+            and starts_alike
+            and is_ours(bound_arguments["preexec_fn"])
+            and Path(folder).is_dir()
+        )
+        if not can_be_forked:
             start(*values, **named)
             return
         descriptors = [0, 1, 2, *bound_arguments["pass_fds"]]
@@ -141,9 +154,15 @@ class Popen(subprocess.Popen):
             bound_arguments["errwrite"],
             *bound_arguments["pass_fds"],
         ]
+        # -1 means that the program inherits the descriptor with its own number.
         files = [number if file == -1 else file for number, file in zip(descriptors, open_descriptors, strict=True)]
         request = Request(
-            words, environment, folder, descriptors, bound_arguments["start_new_session"], bound_arguments["preexec_fn"]
+            words=words,
+            environment=environment,
+            folder=folder,
+            descriptors=descriptors,
+            new_session=bound_arguments["start_new_session"],
+            prepare=bound_arguments["preexec_fn"],
         )
         self.pid = Popen.server.start(request, files)
         self._child_created = True
@@ -152,7 +171,7 @@ class Popen(subprocess.Popen):
 
 
 class Server:
-    """The server as seen by the process that asks. Threads may ask at the same time."""
+    """The server as the process sees it that calls Popen. Several threads may use it at the same time."""
 
     def __init__(self, connection: socket.socket | None = None, pid: int = 0) -> None:
         self._connection = connection
@@ -160,7 +179,7 @@ class Server:
         self._lock = threading.Lock()
 
     def start(self, request: Request, files: list[int]) -> int:
-        """Have a program forked; return its process number."""
+        """Let the server fork a program; return its process id."""
         with self._lock:
             if self._connection is None:
                 self._connection, self._pid = start_server()
@@ -185,9 +204,9 @@ class Server:
 
 
 def install(server: Server) -> None:
-    """Have this process's commands of ours forked. A server without a connection starts with the first of them.
+    """Let this server fork our commands in this process; it is started with the first of them.
 
-    A program that was forked has its server already.
+    A program that was forked has a server already, which is kept.
     """
     if hasattr(subprocess.Popen, "server"):
         return
@@ -196,7 +215,7 @@ def install(server: Server) -> None:
 
 
 def close() -> None:
-    """End the server of this process's commands."""
+    """End this process's server."""
     subprocess.Popen.server.close()  # type: ignore[attr-defined]
 
 
@@ -206,24 +225,24 @@ def adopt_orphans(enabled: bool) -> None:
 
 
 def start_server() -> tuple[socket.socket, int]:
-    """Start the server as a new process; return the connection to it, and its number."""
+    """Start the server as a new process; return the connection to it and its process id."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.set_inheritable(True)
-    words = [sys.executable, __file__, str(theirs.fileno()), " " * ROOM_FOR_WORDS]
+    words = [sys.executable, __file__, str(theirs.fileno()), " " * COMMAND_LINE_BYTES]
     with theirs:
         pid = os.posix_spawn(sys.executable, words, os.environ)
     return ours, pid
 
 
 def preload() -> None:
-    """Import our modules, and what they load when they are called."""
+    """Import our modules, and the libraries that they import later."""
     modules = [
         module.name
         for package in PACKAGES
         for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")
     ]
     with warnings.catch_warnings():
-        # As pytest does, whose workers import nothing of this themselves.
+        # As in pytest, a warning is an error; the workers would not see it, because they do not import these modules.
         warnings.simplefilter("error")
         for name in (*modules, *LIBRARIES):
             if not name.endswith("__main__"):
@@ -232,12 +251,12 @@ def preload() -> None:
 
 
 def serve(connection: socket.socket) -> list[str]:
-    """Fork a program for each request. Return in each program, which is prepared, with its arguments."""
+    """Fork a program for each request. The server does not return; a program returns its arguments when it may run."""
     while True:
         try:
             message, files, _, _ = socket.recv_fds(connection, 1 << 20, 64)
         except ConnectionResetError:
-            # The asking process was killed before it had read the last answer.
+            # The calling process was killed before it had read the last answer.
             os._exit(0)
         if not message:
             os._exit(0)
@@ -248,9 +267,9 @@ def serve(connection: socket.socket) -> list[str]:
             for file in files:
                 os.close(file)
             answer = near.recv(32)
-            # From the end of the middle process on, the program's parent is the process that asked.
+            # When the process in the middle has ended, the calling process becomes the parent of the program.
             os.waitpid(middle, 0)
-            # The asking process may have been killed meanwhile: then there is no further request.
+            # The calling process may have been killed meanwhile: then there is no further request.
             with suppress(BrokenPipeError):
                 connection.send(answer)
             near.close()
@@ -282,7 +301,10 @@ def move_descriptor_up(file: int) -> int:
 
 
 def become(request: Request, files: list[int], starter: int) -> None:
-    """Take over files, arguments, environment and folder; report the process id, and wait for the adoption."""
+    """Take the files, arguments, environment and folder of a request; report the process id, and wait for the parent.
+
+    `starter` is a socket to the server. It is closed when the calling process has become the parent.
+    """
     os.closerange(0, FIRST_SPARE)
     for file, number in zip(files, request.descriptors, strict=True):
         os.dup2(file, number)
@@ -309,8 +331,9 @@ def become(request: Request, files: list[int], starter: int) -> None:
 
 
 def show_in_process_list(words: list[str]) -> None:
-    """Write the arguments over this process's own ones, see proc(5), `arg_start`."""
-    # Fields 48 and 49 of proc_pid_stat(5): the addresses of the arguments; the first field here is the third.
+    """Write the arguments over those with which this process was started, so that `ps` shows them."""
+    # Fields 48 and 49 of proc_pid_stat(5) are the addresses of the arguments' start and end. After the program's name
+    # in brackets the list begins with field 3.
     fields = Path("/proc/self/stat").read_bytes().rpartition(b")")[2].split()
     start = int(fields[45])
     end = int(fields[46])
@@ -328,7 +351,7 @@ def run(words: list[str]) -> int:
         elif words[1:2] == ["-m"]:
             sys.path[0] = str(Path.cwd())
             sys.argv = words[2:]
-            # A module that runs as the program is not yet imported; a package is.
+            # Usually a module that is run as a program has not been imported before; a package with __main__ has.
             if not hasattr(sys.modules.get(words[2]), "__path__"):
                 sys.modules.pop(words[2], None)
             runpy.run_module(words[2], run_name="__main__", alter_sys=True)
@@ -352,21 +375,22 @@ def run(words: list[str]) -> int:
 
 
 def end(status: int) -> None:
-    """End as Python does, but without deleting all modules, which takes longer than most programs."""
+    """End as Python does, but without freeing the memory of all modules, which takes longer than most programs."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     try:
         sys.stdout.flush()
         sys.stderr.flush()
     except OSError:
+        # Python's exit status when it cannot write its last output.
         status = 120
     os._exit(status)
 
 
 def main() -> int:
-    """The server, and in its forks the programs."""
+    """Run the server, and in each of its forks a program."""
     sys.path[0] = str(REPO)
-    # Both come to the whole process group. The server ends with the process that asks.
+    # These signals are sent to the whole process group, but the server must end after the process that uses it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     connection = int(sys.argv[1])

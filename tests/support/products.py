@@ -1,4 +1,7 @@
-"""Made-up products of a judged scan: a metal reference, a named patch, a refused one; and reports without rendering."""
+"""Made-up products of a scan with a verdict, and reports without rendered figures.
+
+The scan has three patches: the metal reference, PET with a name and a permittivity, and one that was refused as noise.
+"""
 
 import struct
 import zlib
@@ -44,7 +47,11 @@ _NEW_KEYS = ("covariance", "dominated_by", "shares", "do")
 
 
 def make_segments(level: str | None) -> list[dict[str, Any]]:
-    """Return three patches as materials.json has them with this verdict; None: as earlier releases wrote them."""
+    """Return the three patches as they are in materials.json with a verdict of this level.
+
+    With the level `none` they have no results. Without a level (None) they are as earlier releases wrote them, which
+    had no verdicts.
+    """
     metal = {**COMMON, "label": 1, "box_mm": [-50.0, -20.0, -20.0, 20.0], "metal_reference": True}
     pet = {
         **COMMON, "label": 2, "box_mm": [-10.0, -20.0, 15.0, 20.0], "name": "PET", "confidence": 0.8,
@@ -53,26 +60,32 @@ def make_segments(level: str | None) -> list[dict[str, Any]]:
     }  # fmt: skip
     noise = {**COMMON, "label": 3, "box_mm": [25.0, -20.0, 50.0, 20.0]}
     noise["refused"] = {"what": "noise", "why": "its pixels do not agree", "do": "look at the image"}
+    segments = [metal, pet, noise]
     if level is None:
-        pet["permittivity"] = {k: v for k, v in PERMITTIVITY.items() if k not in _NEW_KEYS}
-        return [{k: v for k, v in s.items() if k != "refused"} for s in (metal, pet, noise)]
-    if level == "none":
-        no_result = {"name": None, "confidence": None, "permittivity": None, "ratio": None, "votes": {}, "truth": None}
-        return [s | no_result for s in (metal, pet, noise)]
-    return [metal, pet, noise]
+        pet["permittivity"] = {key: value for key, value in PERMITTIVITY.items() if key not in _NEW_KEYS}
+        for segment in segments:
+            segment.pop("refused")
+    elif level == "none":
+        no_results = {"name": None, "confidence": None, "permittivity": None, "ratio": None, "votes": {}, "truth": None}
+        for segment in segments:
+            segment.update(no_results)
+    return segments
 
 
 def write_judged_products(folder: Path, level: str | None, keep_withheld: bool = False, seed: int = 2) -> Path:
-    """Write the files; the images are noise of this seed.
+    """Write products with a verdict of this level (see `make_segments`); the images are noise drawn with this seed.
 
-    With `keep_withheld`, names and permittivities stand in the files although the verdict withholds them, as of a
-    program that forgot to delete them: who shows the products must not show them.
+    With `keep_withheld` the files have names and permittivities although the verdict withholds them, as if a program
+    had forgotten to remove them. Pages and figures must not show them.
     """
     rng = np.random.default_rng(seed)
     h, v = (rng.standard_normal((2, 20, 30)) + 1j * rng.standard_normal((2, 20, 30))).astype(np.complex64)
-    axes = (np.linspace(-0.06, 0.06, 30), np.linspace(-0.04, 0.04, 20))
-    sigma = None if level is None else rng.uniform(0.1, 0.2, h.shape)
-    write_image(folder / "image.npz", Images(h, v, *axes, np.ones(h.shape, bool), h / v, sigma))
+    p_sigma = None if level is None else rng.uniform(0.1, 0.2, h.shape)
+    images = Images(
+        h=h, v=v, x_m=np.linspace(-0.06, 0.06, 30), y_m=np.linspace(-0.04, 0.04, 20), valid=np.ones(h.shape, bool),
+        p=h / v, p_sigma=p_sigma,
+    )  # fmt: skip
+    write_image(folder / "image.npz", images)
     content: dict[str, Any] = {
         "scan_id": "s",
         "simulated": True,
@@ -89,14 +102,17 @@ def write_judged_products(folder: Path, level: str | None, keep_withheld: bool =
 
 
 def name_check_plate(products: Path, plate: CheckPlate) -> None:
-    """Name a check plate in the rig of saved products."""
+    """Make saved products those of a rig whose file has this check plate."""
     facts = read_products(products).facts
     rig = {**facts.instrument, "check": msgspec.to_builtins(plate)}
     write_json(products / SCAN, msgspec.structs.replace(facts, instrument=rig))
 
 
 def make_result(images: Images, content: dict[str, Any] | None, quality: dict[str, Any], **more: Any) -> ProcessedScan:
-    """Return a computed result with these contents of materials.json (None: images only) and quality.json."""
+    """Return the results of a processed scan that are not saved, with the contents of materials.json and quality.json.
+
+    Without materials (None) there are only images.
+    """
     results: dict[str, Any] = {"facts": ScanFacts(scan_id="s", simulated=True), "plates": (), **more}
     materials = None if content is None else ScanMaterials.decode(content)
     return ProcessedScan.from_results(
@@ -105,7 +121,7 @@ def make_result(images: Images, content: dict[str, Any] | None, quality: dict[st
 
 
 def replace_results(scan: ProcessedScan, **content: Any) -> ProcessedScan:
-    """Return the result with other contents."""
+    """Return the same results with other values for the parts named in `content`."""
     results = {name: value for name, value in vars(scan).items() if name in ComputedContent.__annotations__}
     return ProcessedScan.from_results(scan.folder, **{**results, **content})
 

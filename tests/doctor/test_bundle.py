@@ -1,6 +1,10 @@
-"""The bundle has findings, versions, logs and manifests, and neither raw data nor keys."""
+"""The bundle of `polysight doctor`: a ZIP file for a report of a fault.
+
+It has the findings of the checks, versions, logs and the ends of the scans' manifests, but no raw data and no keys.
+"""
 
 import json
+import re
 import zipfile
 from pathlib import Path
 
@@ -17,17 +21,27 @@ from polysight.doctor.context import DoctorOptions, ok
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DeviceError
 
+# Token of the operator's page
 TOKEN = "f00dfacef00dfacef00dfacef00dface"
+# Characters of a CurveZMQ key as text
+KEY_LENGTH = 40
+# Lines of the scan's manifest, and how many of them a bundle has at most.
+MANIFEST_LINES = 200
+BUNDLED_LINES = 60
+# Exit statuses of `polysight doctor`: a check has found an error, and an input does not exist.
+FOUND_AN_ERROR = 1
+MISSING_INPUT = 3
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Path:
-    """A rig file with keys, a scan, logs and traces, each of which contains a key."""
+def rig_folder(tmp_path: Path) -> Path:
+    """A folder with a rig file, keys, a scan, logs and traces. Each file except the raw data contains the same key."""
     keys = tmp_path / "keys"
     keys.mkdir()
     create_certificates(keys, "host")
     create_certificates(keys, "pi")
-    secret = (keys / "host.key_secret").read_text().split('secret-key = "')[1].split('"')[0]
+    _, _, text_after_name = (keys / "host.key_secret").read_text().partition('secret-key = "')
+    secret = text_after_name.partition('"')[0]
     table = load_rig_table()
     table["pi"] |= {"key_dir": str(keys)}
     table["radar"] |= {"trace_dir": str(tmp_path / "traces")}
@@ -35,7 +49,7 @@ def place(tmp_path: Path) -> Path:
     raw = tmp_path / "scans" / "one" / "raw" / "RH"
     raw.mkdir(parents=True)
     (raw / "0000.bin").write_bytes(b"RAWDATA" * 1000)
-    lines = [json.dumps({"fact": "note", "n": n, "text": secret}) for n in range(200)]
+    lines = [json.dumps({"fact": "note", "n": n, "text": secret}) for n in range(MANIFEST_LINES)]
     (raw.parents[1] / "manifest.jsonl").write_text("\n".join(lines) + "\n")
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "pi.log").write_text(f"connected with {secret}\nserve?token={TOKEN}\n")
@@ -51,55 +65,67 @@ def read_contents(file: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def bundle(place: Path) -> dict[str, bytes]:
-    rig = load_instrument(place / "instrument.toml")
-    options = DoctorOptions(place / "instrument.toml", place / "scans")
-    write_bundle(place / "found.zip", options, rig, [ok("all is well")], "ok all is well\n")
-    return read_contents(place / "found.zip")
+def bundle(rig_folder: Path) -> dict[str, bytes]:
+    """Content of the files in the folder's bundle, by name."""
+    rig = load_instrument(rig_folder / "instrument.toml")
+    options = DoctorOptions(config=rig_folder / "instrument.toml", out=rig_folder / "scans")
+    write_bundle(rig_folder / "found.zip", options, rig, [ok("all is well")], "ok all is well\n")
+    return read_contents(rig_folder / "found.zip")
 
 
-def test_the_bundle_has_no_key(place: Path, bundle: dict[str, bytes]) -> None:
-    secret = (place / "secret").read_text()
-    keys = [w for f in (place / "keys").iterdir() for w in f.read_text().split('"') if len(w) == 40]
-    # Two public, two secret
-    assert len({*keys}) == 4
+def test_the_bundle_has_no_key(rig_folder: Path, bundle: dict[str, bytes]) -> None:
+    secret = (rig_folder / "secret").read_text()
+    keys = set()
+    for file in (rig_folder / "keys").iterdir():
+        quoted_texts = file.read_text().split('"')
+        keys |= {text for text in quoted_texts if len(text) == KEY_LENGTH}
+    # A public and a secret one, of host and Pi.
+    assert len(keys) == 4
     assert secret in keys
-    for text in bundle.values():
+    for content in bundle.values():
         for key in (*keys, TOKEN):
-            assert key.encode() not in text
+            assert key.encode() not in content
     assert REDACTION.encode() in bundle["logs/0-pi.log"]
 
 
 def test_the_bundle_has_no_raw_data(bundle: dict[str, bytes]) -> None:
-    assert not any(b"RAWDATA" in text for text in bundle.values())
+    assert not any(b"RAWDATA" in content for content in bundle.values())
     assert not [name for name in bundle if name.endswith((".bin", ".idx", ".pkt", ".npz", ".npy"))]
 
 
-def test_the_bundle_has_findings_versions_and_the_end_of_manifests_and_lists_its_files(
-    bundle: dict[str, bytes],
-) -> None:
+def test_the_bundle_has_findings_versions_and_the_ends_of_manifests(bundle: dict[str, bytes]) -> None:
     assert json.loads(bundle["findings.json"])[0]["found"] == "all is well"
     assert json.loads(bundle["versions.json"])["packages"]["numpy"]
     assert json.loads(bundle["network.json"])["interfaces"]
     assert b"Linux" in bundle["kernel.txt"]
     assert b"[grid]" in bundle["rig.toml"]
     manifest = bundle["scans/one.jsonl"].splitlines()
-    assert [json.loads(line)["n"] for line in manifest] == list(range(140, 200))
-    listed = bundle["README.txt"].decode()
-    assert all(name.partition("/")[0] in listed for name in bundle if name != "README.txt")
+    last_lines = list(range(MANIFEST_LINES - BUNDLED_LINES, MANIFEST_LINES))
+    assert [json.loads(line)["n"] for line in manifest] == last_lines
+
+
+def test_the_bundle_s_readme_lists_its_files_and_folders(bundle: dict[str, bytes]) -> None:
+    readme = bundle["README.txt"].decode()
+    for name in bundle:
+        file_or_folder = name.partition("/")[0]
+        assert file_or_folder in readme or name == "README.txt"
 
 
 def test_the_command_writes_a_bundle_although_the_rig_file_is_damaged(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text("grid = ")
-    out = tmp_path / "found.zip"
-    assert main(["doctor", "--config", str(tmp_path / "rig.toml"), "--out", str(tmp_path), "--bundle", str(out)]) == 1
-    contents_of_bundle = read_contents(out)
-    assert json.loads(contents_of_bundle["findings.json"])[0]["verdict"] == "error"
-    assert contents_of_bundle["rig.toml"] == b"grid = "
+    damaged_file = tmp_path / "rig.toml"
+    damaged_file.write_text("grid = ")
+    file = tmp_path / "found.zip"
+    status = main(["doctor", "--config", str(damaged_file), "--out", str(tmp_path), "--bundle", str(file)])
+    assert status == FOUND_AN_ERROR
+    bundle = read_contents(file)
+    assert json.loads(bundle["findings.json"])[0]["verdict"] == "error"
+    assert bundle["rig.toml"] == b"grid = "
 
 
-def test_a_missing_folder_is_refused_before_the_checks_run(tmp_path: Path) -> None:
-    assert main(["doctor", "--config", "none.toml", "--bundle", str(tmp_path / "not" / "found.zip")]) == 3
+def test_a_missing_folder_for_the_bundle_is_refused_before_the_checks_run(tmp_path: Path) -> None:
+    """Otherwise the missing rig file would be reported first, with another status."""
+    file = tmp_path / "missing" / "found.zip"
+    assert main(["doctor", "--config", "none.toml", "--bundle", str(file)]) == MISSING_INPUT
 
 
 @pytest.mark.parametrize(
@@ -120,22 +146,26 @@ def test_a_missing_folder_is_refused_before_the_checks_run(tmp_path: Path) -> No
         "APIKEY={}",
     ],
 )
-def test_the_value_of_a_name_like_key_or_token_is_removed(text: str) -> None:
-    key = zmq.curve_keypair()[1].decode()
-    for word in (key.replace('"', "a").replace("'", "a").replace(",", "a").replace("}", "a"), "short-but-secret"):
-        assert word not in Redactor([])(text.format(word))
+def test_the_value_after_a_word_such_as_key_or_token_is_removed(text: str) -> None:
+    _, secret_key = zmq.curve_keypair()
+    # Without characters that end a value in one of these texts
+    key = re.sub(r"""["',}]""", "a", secret_key.decode())
+    redact = Redactor([])
+    for value in (key, "short-but-secret"):
+        assert value not in redact(text.format(value))
 
 
 def test_a_key_with_equals_signs_is_removed_as_a_whole(tmp_path: Path) -> None:
-    # Z85, the form of CurveZMQ's keys, has "=" among its characters: one piece between them may be short.
+    # "=" is one of the characters of CurveZMQ's keys, and also separates a name from its value.
     key = "0123456789abc=0123456789abc=0123456789ab"
     (tmp_path / "host.key_secret").write_text(f'curve\n    secret-key = "{key}"\n')
     assert Redactor([tmp_path])(f"connected with {key}") == f"connected with {REDACTION}"
 
 
-def test_tokens_of_known_forms_are_removed_without_a_name() -> None:
-    assert "abcdefghijklmnop" not in Redactor([])("pushed with ghp_abcdefghijklmnopqrst")
-    assert "pw99" not in Redactor([])("from http://u:pw99@host:80/x")
+def test_tokens_of_github_and_passwords_in_addresses_are_removed() -> None:
+    redact = Redactor([])
+    assert "abcdefghijklmnop" not in redact("pushed with ghp_abcdefghijklmnopqrst")
+    assert "pw99" not in redact("from http://u:pw99@host:80/x")
 
 
 def test_other_text_is_kept() -> None:
@@ -143,11 +173,12 @@ def test_other_text_is_kept() -> None:
     assert Redactor([])(text) == text
 
 
-def test_a_bundle_that_cannot_be_written_leaves_the_earlier_one(tmp_path: Path) -> None:
-    """Also on a full disk: no half archive."""
+def test_a_full_disk_leaves_the_earlier_bundle_and_no_incomplete_one(tmp_path: Path) -> None:
     file = tmp_path / "found.zip"
     file.write_bytes(b"earlier")
-    with FaultyDisk(tmp_path, "short", 1)(), pytest.raises(DeviceError):
-        write_bundle(file, DoctorOptions(tmp_path / "instrument.toml"), None, [ok("fine")], "fine")
+    full_disk = FaultyDisk(tmp_path, fault="short", at=1)
+    options = DoctorOptions(config=tmp_path / "instrument.toml")
+    with full_disk(), pytest.raises(DeviceError):
+        write_bundle(file, options, None, [ok("fine")], "fine")
     assert file.read_bytes() == b"earlier"
     assert list(tmp_path.iterdir()) == [file]

@@ -1,1 +1,1 @@
-"""Rigs and benches for the doctor."""
+"""Rigs and contexts for the checks of `polysight doctor`."""

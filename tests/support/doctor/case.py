@@ -1,4 +1,4 @@
-"""A rig with programmed start frequencies, contexts for single checks, and simulated frames of a board at rest."""
+"""For single checks of `polysight doctor`: a rig, the context of a check, and simulated frames of a board at rest."""
 
 import functools
 from pathlib import Path
@@ -13,16 +13,16 @@ from tests.support.rigs import make_programmed_rig
 
 
 def report_no_loss(_rig, rates):
-    """Stands in for the measurement of the receivers: each rate is reached, and none of nine packets is lost."""
+    """Replaces the measurement of the receivers: each rate is reached, and none of nine packets is lost."""
     return [LoadResult(wanted=rate, reached=rate, sent=9, lost=0) for rate in rates], "any core"
 
 
-# A computer whose disk (200 MB/s, chosen) and receivers count as fast enough, without a measurement.
+# A computer whose disk (200 MB/s) and receivers are fast enough; nothing is measured.
 QUICK = System(write_speed=lambda _folder: 200e6, measure_receivers=report_no_loss)
-# Frames of a board at rest; chosen.
+# Number of simulated frames of a board
 FRAMES = 32
 RIG = make_programmed_rig()
-# A scene of one point in front of the middle of a small grid.
+# A scene of one point in front of the middle of a small grid
 SMALL = {
     "name": "s",
     "grid": {"columns": 4, "rows": 2},
@@ -41,7 +41,7 @@ def simulate_frames(board, rig=RIG, **disturbances):
 
 @functools.cache
 def make_setup(board):
-    """The setup by which a board's direct path is found. It is the same for any start frequency: made once."""
+    """The setup with which a board's direct path is found. It does not depend on the start frequency: made once."""
     return BoardSetup.from_rig(RIG, RIG.by_name(board))
 
 

@@ -1,4 +1,4 @@
-"""The simulated rig as processes for the doctor, and a fake Pi that only answers requests."""
+"""For checks of `polysight doctor` on a running rig: the simulated rig as processes, and a fake Pi."""
 
 import os
 import signal
@@ -41,7 +41,7 @@ if_offset_hz = 0.0
 
 
 def make_impatient_rig() -> Instrument:
-    """A rig with the direct path mid-band and short timeouts (chosen), which needs hardly any free space."""
+    """A rig with the direct path in the middle of the band and short timeouts, which needs little space on the disk."""
     return make_programmed_rig(limits={"command_timeout_s": 6.0, "end_of_record_s": 1.0, "free_disk_bytes": 1 << 20})
 
 
@@ -57,7 +57,7 @@ class LiveRig:
         return load_instrument(self.config)
 
     def write_variant(self, change: Callable[[dict], None]) -> Path:
-        """Write a changed rig file for the same rig."""
+        """Write a changed copy of the rig file; return its path."""
         table = to_builtins(self.instrument)
         change(table)
         path = self.folder / "variant.toml"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
-from tests.support.store.faulty_disk import GROWS, FaultyDisk
+from tests.support.store.faulty_disk import NEED_SPACE, FaultyDisk
 from tests.support.store.plain_scan import list_errors
 from tests.support.store.small_scan import Samples, SmallScan
 
@@ -81,7 +81,7 @@ def list_operations_that_need_space(samples: Samples, folder: Path, disk_of: str
     disk = FaultyDisk(folder / disk_of)
     with disk():
         SmallScan(samples, folder).run()
-    return [i for i, description in enumerate(disk.done, 1) if description.split()[0] in GROWS]
+    return [i for i, description in enumerate(disk.done, 1) if description.split()[0] in NEED_SPACE]
 
 
 def run_on_disk(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:

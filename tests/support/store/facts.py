@@ -1,4 +1,4 @@
-"""The facts of a scan as they are in its file."""
+"""The facts of a scan: the lines of its manifest, each a JSON object."""
 
 from pathlib import Path
 from typing import Any
@@ -8,13 +8,22 @@ from polysight.store.manifest import decode_line, encode_line, parse
 
 
 def load_facts(scan: Any, kind: str = "") -> list[dict[str, Any]]:
-    """Return the valid facts of a scan (its folder, manifest, or a `ScanFolder`), of one kind or all, without chain."""
+    """Return the valid facts of a scan: all, or those of one kind.
+
+    `scan` is its folder, its manifest, or a `ScanFolder`. The keys by which a line refers to the previous one are left
+    out.
+    """
     path = Path(getattr(scan, "path", scan))
-    lines = (path / MANIFEST if path.is_dir() else path).read_bytes().split(b"\n")
-    facts = [fact for line in lines if (fact := decode_line(line)) is not None and kind in ("", fact["fact"])]
-    return [{key: value for key, value in fact.items() if key not in ("count", "previous")} for fact in facts]
+    if path.is_dir():
+        path = path / MANIFEST
+    facts = []
+    for line in path.read_bytes().split(b"\n"):
+        fact = decode_line(line)
+        if fact is not None and kind in ("", fact["fact"]):
+            facts.append({key: value for key, value in fact.items() if key not in ("count", "previous")})
+    return facts
 
 
 def parse_fact(fact: dict[str, Any]) -> Any:
-    """Return a fact as the program reads its line."""
+    """Return the object that the program makes of a fact's line."""
     return parse(encode_line(fact)).facts[0]

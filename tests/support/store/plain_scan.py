@@ -1,4 +1,4 @@
-"""A scan folder of constant bytes, written without any rig."""
+"""A scan folder with simple content, written without a rig: all bytes of a row are the same."""
 
 import zlib
 from pathlib import Path
@@ -13,11 +13,12 @@ from polysight_shared.messages import Fault, RunStarted
 from polysight_shared.raster import plan_raster
 from tests.support.acquisition.fake_rig import make_small_instrument
 
+# Missing byte ranges (start, stop) by board and row
 Gaps = dict[tuple[str, int], list[tuple[int, int]]]
 
 
 def write_scan(folder: Path, gaps: Gaps | None = None) -> Path:
-    """Four committed rows, all bytes of row k being k + 1; `gaps` are missing byte ranges by board and row."""
+    """Write a scan of four committed rows; return its path. All bytes of row k are k + 1, and those of gaps are 0."""
     instrument = make_small_instrument()
     scan = ScanFolder.create(folder, instrument, plan_raster(instrument.grid), simulated=True)
     frames = instrument.grid.columns * instrument.burst.pulses
@@ -32,15 +33,17 @@ def write_scan(folder: Path, gaps: Gaps | None = None) -> Path:
             for name in ("RH", "RV"):
                 missing = (gaps or {}).get((name, row.index), [])
                 data = np.full(instrument.row_bytes, row.index + 1, dtype=np.uint8)
-                for a, b in missing:
-                    data[a:b] = 0
+                for start, stop in missing:
+                    data[start:stop] = 0
                 path = scan.row_path(name, row.index)
                 data.tofile(path)
-                index = write_index(path.with_suffix(".idx"), {"missing": missing}, np.zeros((2, 2), dtype=np.int64))
+                arrivals = np.zeros((2, 2), dtype=np.int64)
+                index_crc = write_index(path.with_suffix(".idx"), {"missing": missing}, arrivals)
                 boards[name] = {
                     "file": str(path.relative_to(scan.path)), "bytes": data.size, "frames_expected": frames,
-                    "frames_received": frames - len(missing), "missing_bytes": sum(b - a for a, b in missing),
-                    "crc32": f"{zlib.crc32(data.tobytes()):08x}", "index_crc32": f"{index:08x}",
+                    "frames_received": frames - len(missing),
+                    "missing_bytes": sum(stop - start for start, stop in missing),
+                    "crc32": f"{zlib.crc32(data.tobytes()):08x}", "index_crc32": f"{index_crc:08x}",
                 }  # fmt: skip
             committed = {"fact": "row_committed", "row": row.index, "take": 1, "direction": row.direction}
             writer.append({**committed, "boards": boards, "pulses": frames})
@@ -49,5 +52,5 @@ def write_scan(folder: Path, gaps: Gaps | None = None) -> Path:
 
 
 def list_errors(folder: Path) -> list[str]:
-    """Errors of a scan folder, without notes."""
+    """Errors that a validation of the scan folder finds; notes are left out."""
     return [to_text(f) for f in validate(folder) if f.level == "error"]

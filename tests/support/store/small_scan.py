@@ -1,7 +1,7 @@
-"""A scan without processes: the host's own run and resume, the Pi's own journal, and simulated samples.
+"""A scan in the tests' own process, which takes some milliseconds.
 
-All files are written by the code that writes them in the instrument; only wires, sockets and
-time are left out. A whole scan takes some milliseconds.
+The host's functions that run and resume scans, the Pi's journal and the functions that write files are those of the
+instrument. Only the wires, the sockets and the time between events are missing, and the samples are simulated.
 """
 
 import hashlib
@@ -39,7 +39,7 @@ SCENE = write_small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
 
 
 class Samples:
-    """Simulated samples of every row, the same for every take."""
+    """Simulated samples of every row; each take of a row has the same ones."""
 
     def __init__(self, folder: Path) -> None:
         (folder / "scene.toml").write_text(SCENE)
@@ -59,7 +59,7 @@ class Samples:
 
 
 class SmallPi:
-    """A Pi in place of its client: it writes the Pi's journal, and rows end immediately."""
+    """Stands in for the host's client of the Pi: it writes the Pi's journal itself, and a row ends immediately."""
 
     def __init__(self, instrument: Instrument, folder: Path) -> None:
         self._instrument = instrument
@@ -72,7 +72,7 @@ class SmallPi:
         self.state: m.State = "ready"
         self.fault = ""
         self.gaps_filled = 0
-        # A socket with data that is always ready to be read.
+        # The host waits until it can read from this descriptor: always.
         self.event_socket = os.eventfd(1)
 
     def follow(self, scan_id: str, last_seq: int, on_event: Any) -> None:
@@ -81,7 +81,7 @@ class SmallPi:
         self._take = on_event
 
     def _commit(self, kind: type[m.AnyEvent], *events: dict[str, Any]) -> None:
-        """Write events as the Pi's executor does: if the journal fails the Pi is in fault."""
+        """Write events as the Pi's executor does: it goes into the state `fault` if the journal cannot be written."""
         try:
             self._journal.write([NewEvent.now(kind, **event) for event in events])
         except JournalFullError as e:
@@ -102,7 +102,7 @@ class SmallPi:
         )  # fmt: skip
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
-        """Journal a whole row."""
+        """Write all events of a row to the journal; their times are placeholders."""
         assert scan_id == self._scan_id
         row = self._plan.row(row_index)
         n = self._instrument.burst.pulses
@@ -123,7 +123,7 @@ class SmallPi:
             self._commit(m.RowFinished, end)
 
     def events(self) -> list[m.AnyEvent]:
-        """Return new events of the journal."""
+        """Return the events that were written to the journal since the last call."""
         unpacked = [m.unpack_event(raw) for raw in self._journal.read(self._scan_id, self._seen + 1, 10000)[0]]
         for event in unpacked:
             assert event.seq == self._seen + 1, "the sequence has a gap"
@@ -132,7 +132,7 @@ class SmallPi:
         return unpacked
 
     def drain(self) -> None:
-        """No events are pending."""
+        """Do nothing: no events are waiting in a socket."""
 
     def end_run(self, scan_id: str, exit_status: m.ExitStatus, reason: str) -> None:
         assert scan_id == self._scan_id
@@ -151,13 +151,13 @@ class SmallPi:
         raise AssertionError(f"nothing asks for an abort here: {reason}")
 
     def lose(self) -> None:
-        """End the program; its files stay."""
+        """End the Pi's program as a power cut would: only its files remain."""
         os.close(self.event_socket)
         os.close(self._journal._lock)
 
 
 class SmallRig:
-    """Cards and receivers in place of CaptureRig: every byte arrives, and rows are written as by its receivers."""
+    """Stands in for CaptureRig: every byte of the cards arrives, and rows are written as its receivers write them."""
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
@@ -182,14 +182,14 @@ class SmallRig:
         return {}
 
     def discard_before(self, not_before_ns: int) -> None:
-        """No packets are left over."""
+        """Do nothing: there are no packets of an earlier row."""
 
     def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:
         del not_before_ns
         return {name: self._end(name, segment) for name, segment in self._segments.items()}
 
     def _end(self, name: str, segment: Segment) -> RowCapture:
-        """Place and write the row of one board, as its receiver does."""
+        """Write the packets of one board's row to its files, as the receiver does."""
         row, take = self._row
         data = self._samples.get_payload(name, row)
         log = PacketLog(len(data))
@@ -213,7 +213,7 @@ class SmallRig:
 
 
 class SmallScan:
-    """A scan in `folder`/scan with its journal in `folder`/journal; `run` starts or resumes it."""
+    """A scan in `folder`/scan, and the Pi's journal in `folder`/journal; `run` starts or resumes it."""
 
     def __init__(self, samples: Samples, folder: Path) -> None:
         self._samples = samples
@@ -224,7 +224,7 @@ class SmallScan:
 
     @contextmanager
     def _connect_pi(self) -> Iterator[None]:
-        """Replace the sockets by a Pi that was just started, or one that continues."""
+        """Replace the connections to Pi and cards by stand-ins; the Pi continues its journal if there is one."""
         instrument = self._samples.instrument
         with ExitStack() as stack:
             pi = SmallPi(instrument, self.journals)
@@ -245,7 +245,7 @@ class SmallScan:
 
     @property
     def begun(self) -> bool:
-        """True if the manifest has its first line."""
+        """True once the scan's manifest has its first line."""
         path = self.path / MANIFEST
         return path.exists() and manifest.read(path).length > 0
 

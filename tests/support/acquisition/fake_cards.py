@@ -1,4 +1,4 @@
-"""Capture cards that only answer commands and send made-up rows, over UDP on loopback."""
+"""Fake capture cards, which answer commands and send made-up rows over UDP on the loopback network."""
 
 import functools
 import socket
@@ -46,18 +46,20 @@ class FakeCard:
         self.silent_data = False
         # Codes of all commands.
         self.codes_received: list[int] = []
-        # Faults by (row, take). Numbers (from 0) of the packets of the record that are lost.
+        # Faults by (row, take), set by tests. Numbers (from 0) of the packets that are lost:
         self.drop: dict[tuple[int, int], set[int]] = {}
-        # Bytes that the record lacks at its end, as if the radar had missed triggers.
+        # Bytes that the record lacks at its end, as if the radar had missed triggers:
         self.missing_end_bytes: dict[tuple[int, int], int] = {}
-        # Pulses that the radar missed, for rows that are sent frame by frame.
+        # Numbers of the pulses that the radar misses, in rows that are sent frame by frame:
         self.missed: dict[tuple[int, int], set[int]] = {}
-        # Before this pulse the radar takes a spurious edge for a pulse: all later frames come one too early.
+        # Number of the pulse before which the radar takes a spurious edge for a pulse, so that all later frames come
+        # one too early:
         self.extra: dict[tuple[int, int], int] = {}
-        # Of rows that are sent frame by frame: bytes of the record so far, and when they would arrive.
+        # In rows that are sent frame by frame: the time at which a packet would arrive, by the bytes of the record up
+        # to its end.
         self.arrivals_ns: dict[int, int] = {}
         self._record_bytes = 0
-        # Bytes that do not fill a packet yet.
+        # Bytes that do not fill a packet yet
         self._rest = b""
         self._arrival_ns = 0
         self._stop = threading.Event()
@@ -70,7 +72,8 @@ class FakeCard:
                 raw, sender = self.commands.recvfrom(2048)
             except TimeoutError:
                 continue
-            code = struct.unpack_from("<H", raw, 2)[0]
+            # The second of 16-bit words
+            (code,) = struct.unpack_from("<H", raw, 2)
             self.codes_received.append(code)
             if not self.mute:
                 self._command(code, sender)
@@ -83,7 +86,7 @@ class FakeCard:
             self.recording = True
             self.arrivals_ns = {}
             self._record_bytes = 0
-        # A reset begins the counters again.
+        # A reset starts the counters again.
         if code == Code.RESET_FPGA:
             self.sequence = 1
             self.count = 0

@@ -1,4 +1,7 @@
-"""A fake Pi that only speaks the wire protocol, with fake capture cards, on a loopback subnet of their own."""
+"""A fake Pi that only speaks the wire protocol, and fake capture cards, on a loopback network of their own.
+
+When the host lets the Pi run a row, the Pi lets the cards send the row's data, and publishes the row's events.
+"""
 
 import threading
 import time
@@ -15,18 +18,18 @@ from tests.support.acquisition.fake_cards import FakeCard
 from tests.support.processes import HANG_S
 from tests.support.rigs import make_rig_with
 
-# The Pi's clock less the host's; chosen.
+# The Pi's clock minus the host's
 PI_AHEAD_NS = 77_000_000_000
-# Faults after which the Pi stays in state `fault` until the next homing. After the second two the stage is where it
-# was, so that it counts as homed.
+# After these faults the Pi stays in the state `fault` until the next homing. Those of the second line do not concern
+# the stage, so that its position is known and it counts as homed.
 STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)
 FAULTS_AT_A_KNOWN_POSITION = (PiFault.TRIGGER_LINE_LOST, PiFault.JOURNAL_FULL)
-# Time between heartbeats; chosen.
+# Time between heartbeats
 HEARTBEAT_MS = 50
-# Events in one reply to Replay; chosen. Like the Pi while a row runs it sends fewer than the host requests.
+# Events in one reply to Replay: fewer than the host requests, as in a reply of the Pi while a row runs.
 MAX_REPLAYED_EVENTS = 3
-# Times of a row that is sent frame by frame, chosen: a burst at each position, the pulses in it, and the time from a
-# pulse until its frame arrives.
+# In rows that are sent frame by frame: the time between bursts, the time between the pulses of a burst, and the time
+# from a pulse until its frame arrives.
 BURST_PERIOD_NS = 60_000_000
 PULSE_PERIOD_NS = 1_500_000
 ARRIVAL_DELAY_NS = 100_000
@@ -117,7 +120,7 @@ class FakePi:
         self.context.term()
 
     def _scan_id(self) -> str:
-        # A test may replace it meanwhile.
+        # A test may set `self.run` to None between the two uses.
         run = self.run
         return run.scan_id if run else ""
 
@@ -233,10 +236,7 @@ class FakePi:
             )  # fmt: skip
 
     def _send_frames(self, row: Row, take: int) -> None:
-        """Send all frames together, with the times of a row that has run until now.
-
-        Capture events have the Pi's own clock.
-        """
+        """Send all frames at once, with the times of a row that ends now; events have the time of the Pi's clock."""
         assert self.run is not None
         n = self.run.pulses
         begin_ns = time.monotonic_ns() - row.points * BURST_PERIOD_NS

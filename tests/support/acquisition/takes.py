@@ -1,4 +1,7 @@
-"""A take of a row of three positions, its end and its boards, with one difference at a time."""
+"""A take of a row of three positions without faults: the Pi's report of its end, and what each board has received.
+
+A test replaces one field at a time.
+"""
 
 from typing import Any
 

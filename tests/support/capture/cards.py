@@ -15,14 +15,17 @@ from polysight_simulators.faults import Faults
 from tests.support.processes import HANG_S
 
 LIMIT_S = 60.0
-# Bytes that a streaming radar sends in one turn of the thread, about 5 MB/s in all.
+# Bytes that a streaming radar sends in each turn of the thread: about 5 MB/s.
 FRAMES = np.arange(8192, dtype="<u4").view(np.uint8)
-# A card with more bytes unsent gets none for a while.
+# A radar waits while its card has more unsent bytes than this.
 MAX_QUEUED_BYTES = 1 << 20
+# First and last word of a command's reply
+HEADER = 0xA55A
+FOOTER = 0xEEAA
 
 
 class Cards:
-    """Simulated cards, all served by one thread; the radars of some stream."""
+    """Simulated cards, all served by one thread, with radars that send them data."""
 
     def __init__(self) -> None:
         self.endpoints: dict[str, CardEndpoint] = {}
@@ -33,7 +36,7 @@ class Cards:
         self._thread = threading.Thread(target=self._serve)
 
     def add(self, name: str, network: Network, faults: Faults, streamed_bytes: int) -> None:
-        """Add a card before `start`; its radar streams so many bytes once it records."""
+        """Add a card before `start`. Its radar sends `streamed_bytes` while the card records."""
         self.endpoints[name] = CardEndpoint(
             name=name, network=network, faults=faults, seed=0, time_scale=1.0, clock_s=time.monotonic
         )
@@ -41,7 +44,7 @@ class Cards:
 
     @staticmethod
     def card_network(board: Board) -> Network:
-        """Network settings in the EEPROM of a board's card."""
+        """Network settings that the card of a board has in its EEPROM."""
         return Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
 
     def start(self) -> None:
@@ -60,9 +63,9 @@ class Cards:
                 self._tasks.pop(0)()
             for name, endpoint in self.endpoints.items():
                 endpoint.serve_commands()
-                has_room = endpoint.sender.queued_bytes < MAX_QUEUED_BYTES
-                streams = endpoint.counts["bytes_made"] < self._streaming[name]
-                if streams and endpoint.card.recording and has_room:
+                can_queue = endpoint.sender.queued_bytes < MAX_QUEUED_BYTES
+                has_data = endpoint.counts["bytes_made"] < self._streaming[name]
+                if has_data and endpoint.card.recording and can_queue:
                     endpoint.emit(endpoint.card.process_lvds(FRAMES, endpoint.wire_s()))
                 endpoint.tick()
                 endpoint.flush()
@@ -76,10 +79,13 @@ class Cards:
 
 
 class ScriptedCard:
-    """A card that replies `answers(code, count)` to each request; `count`: how often the code was received."""
+    """A card that replies to each request what `answers(code, count)` returns.
+
+    `count` is the number of requests with this code so far, 1 for the first one.
+    """
 
     def __init__(self, board: Board, answers: Callable[[int, int], Iterable[bytes]], source_port: int = 1024) -> None:
-        # Code and data of all requests.
+        # Code and data of each request
         self.seen: list[tuple[int, bytes]] = []
         self._answers = answers
         self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -98,13 +104,15 @@ class ScriptedCard:
                 raw = self._in.recv(2048)
             except TimeoutError:
                 continue
+            # A request has the words header, code and length, its data, and the word footer.
             code = int.from_bytes(raw[2:4], "little")
             self.seen.append((code, raw[6:-2]))
-            for raw in self._answers(code, sum(c == code for c, _ in self.seen)):
-                self._out.sendto(raw, self.host)
+            count = sum(seen_code == code for seen_code, _ in self.seen)
+            for answer in self._answers(code, count):
+                self._out.sendto(answer, self.host)
 
     def say(self, raw: bytes) -> None:
-        """Send something without a request."""
+        """Send bytes to the host without a request."""
         self._out.sendto(raw, self.host)
 
     def close(self) -> None:
@@ -116,4 +124,4 @@ class ScriptedCard:
 
 def reply(code: int, status: int = 0) -> bytes:
     """Return a card's reply to a command."""
-    return struct.pack("<4H", 0xA55A, code, status, 0xEEAA)
+    return struct.pack("<4H", HEADER, code, status, FOOTER)

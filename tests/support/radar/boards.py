@@ -1,4 +1,7 @@
-"""A rig under native control, virtual time, and simulated boards that are reached by words."""
+"""Simulated radar boards under native control: the host itself programs them over USB, without TI's mmWave Studio.
+
+The tests have virtual time, and exchange 16-bit words with a board without a USB bus between them.
+"""
 
 from collections.abc import Sequence
 
@@ -6,11 +9,13 @@ import msgspec
 
 from polysight_shared.config import Instrument, NativeRadar, Radar
 from polysight_simulators.radars import FUNCTIONAL_LEVELS, RadarBoard
-from tests.support.rigs import load_published_rig
+from tests.support.rigs import MID_BAND_OFFSET_HZ, load_published_rig
+
+FIRST_WORD_OF_COMMAND = 0x1234
 
 
 class VirtualClock:
-    """Virtual time, advanced by `sleep` and slightly by `now`."""
+    """Virtual time in seconds. `sleep` advances it, and each call of `now` by a microsecond."""
 
     def __init__(self) -> None:
         self.time = 0.0
@@ -24,7 +29,7 @@ class VirtualClock:
 
 
 class BoardWords:
-    """The word link of a simulated board, without USB."""
+    """Link to a simulated board that transfers words without USB; a word takes 2 microseconds."""
 
     def __init__(self, board: RadarBoard, clock: VirtualClock) -> None:
         self.board = board
@@ -52,21 +57,21 @@ class BoardWords:
 
 
 class Restarts(BoardWords):
-    """Interrupt the board's supply for a moment after `after` commands of its host."""
+    """Link to a board whose power fails for a moment after the command number `after` (counted from 1)."""
 
     def __init__(self, board: RadarBoard, clock: VirtualClock, after: int) -> None:
         super().__init__(board, clock)
-        # Commands until the restart, and commands after it.
+        # Commands until the power fails, and commands after that.
         self.left = after
         self.later = 0
 
     def write(self, words: Sequence[int]) -> None:
         super().write(words)
-        # A command begins with this word.
-        if words[0] == 0x1234:
+        if words[0] == FIRST_WORD_OF_COMMAND:
             self.left -= 1
-            self.later += self.left < 0
-            if self.left == 0:
+            if self.left < 0:
+                self.later += 1
+            elif self.left == 0:
                 self.board.switch_power(False)
                 self.board.switch_power(True)
 
@@ -74,11 +79,16 @@ class Restarts(BoardWords):
 def make_native_rig() -> Instrument:
     """Return the published rig under native control, with the direct path in the middle of each receiver's IF band."""
     rig = load_published_rig()
-    boards = tuple(b if b.role == "transmit" else msgspec.structs.replace(b, start_offset_hz=790e3) for b in rig.boards)
-    radar = Radar(control="native", native={b.name: NativeRadar(usb_serial=f"FT{b.name}") for b in boards})
-    return msgspec.structs.replace(rig, boards=boards, radar=radar)
+    boards = []
+    for board in rig.boards:
+        if board.role == "transmit":
+            boards.append(board)
+        else:
+            boards.append(msgspec.structs.replace(board, start_offset_hz=MID_BAND_OFFSET_HZ))
+    radars = {board.name: NativeRadar(usb_serial=f"FT{board.name}") for board in boards}
+    return msgspec.structs.replace(rig, boards=tuple(boards), radar=Radar(control="native", native=radars))
 
 
 def change_radar_table(rig: Instrument, **values: object) -> Instrument:
-    """Return the rig with other values in its table [radar]."""
+    """Return the rig with other values in the table [radar] of its file."""
     return msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, **values))

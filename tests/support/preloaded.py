@@ -260,38 +260,41 @@ def serve(connection: socket.socket) -> list[str]:
             os._exit(0)
         if not message:
             os._exit(0)
-        near, far = socket.socketpair()
-        middle = os.fork()
-        if middle:
-            far.close()
+        # The program reports its process id to the server by these.
+        server_end, program_end = socket.socketpair()
+        middle_pid = os.fork()
+        if middle_pid:
+            program_end.close()
             for file in files:
                 os.close(file)
-            answer = near.recv(32)
+            answer = server_end.recv(32)
             # When the process in the middle has ended, the calling process becomes the parent of the program.
-            os.waitpid(middle, 0)
+            os.waitpid(middle_pid, 0)
             # The calling process may have been killed meanwhile: then there is no further request.
             with suppress(BrokenPipeError):
                 connection.send(answer)
-            near.close()
+            server_end.close()
             continue
         if os.fork():
             os._exit(0)
         request = Request(*pickle.loads(message))
-        spare = [move_descriptor_up(file) for file in files]
-        for end in (connection, near):
-            end.close()
+        passed_files = [move_descriptor_up(file) for file in files]
+        connection.close()
+        server_end.close()
         if may_start_others(request.words):
-            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            server = os.fork()
-            if not server:
-                for file in (ours.detach(), far.detach(), *files, *spare):
+            # The program gets a server of its own, which is another fork.
+            end_of_program, end_of_new_server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            new_server_pid = os.fork()
+            if not new_server_pid:
+                for file in (end_of_program.detach(), program_end.detach(), *files, *passed_files):
                     os.close(file)
-                connection = theirs
+                connection = end_of_new_server
                 continue
-            theirs.close()
-            install(Server(socket.socket(fileno=move_descriptor_up(ours.detach())), server))
+            end_of_new_server.close()
+            connection_to_server = socket.socket(fileno=move_descriptor_up(end_of_program.detach()))
+            install(Server(connection_to_server, new_server_pid))
             atexit.register(Popen.server.close)
-        become(request, spare, move_descriptor_up(far.detach()))
+        become(request, passed_files, move_descriptor_up(program_end.detach()))
         return request.words
 
 

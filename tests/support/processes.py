@@ -1,7 +1,4 @@
-"""Commands of the host and of the Pi, run as a user runs them.
-
-They run as processes, or in this one where the process does not matter.
-"""
+"""Run commands of the host and of the Pi as a user does: as processes, or faster in the process of the tests."""
 
 import io
 import os
@@ -18,17 +15,18 @@ import pytest
 from polysight.cli.main import main
 from tests.support.paths import BIN
 
-# Idle seconds of this machine after which a test that waits for something fails (see `read_idle_s`); chosen.
+# A test that waits for something fails when the processor has been idle for so many seconds (see `read_idle_s`).
 LIMIT_S = 60.0
-# Seconds by the clock after which a call that blocks (socket, queue, thread) counts as hanging. Chosen: no busy machine
-# reaches it.
+# A call that blocks (socket, queue, thread) counts as hanging after so many seconds by the clock, also on a busy
+# machine.
 HANG_S = 900.0
 
 
 def read_idle_s() -> float:
-    """Return the seconds that this machine was idle since its start, the mean over its cores.
+    """Return the seconds for which the processor has been idle since the machine started, the mean of its cores.
 
-    Waits are limited by these seconds, not by the clock: a busy machine that is slow does not count as hanging.
+    Tests limit their waits by idle seconds instead of the clock. On a busy machine a slow program does not reach the
+    limit, while a program that hangs leaves the processor idle.
     """
     # The first line of proc_stat(5): after the name the ticks in user, nice, system and idle state.
     ticks = Path("/proc/stat").read_text(encoding="ascii").split(maxsplit=5)[4]
@@ -45,7 +43,7 @@ class Ended:
 
     @property
     def message(self) -> str:
-        """The error message. Fails if there is a traceback, no message, or more than one."""
+        """The error message and the lines after it. Fails if there is a traceback, or not exactly one message."""
         assert "Traceback" not in self.err, self.err
         starts = ("polysight ", "error: ", "usage: ")
         lines = self.err.splitlines()
@@ -55,7 +53,7 @@ class Ended:
 
 
 def wait_for(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
-    """Return when the condition holds; fail when the machine has idled for `limit_s` meanwhile."""
+    """Return when the condition holds; fail after `limit_s` idle seconds. `what` describes the condition."""
     deadline = read_idle_s() + limit_s
     while not condition():
         assert read_idle_s() < deadline, f"not within {limit_s} s: {what}"
@@ -114,7 +112,7 @@ class Program:
         os.killpg(self.process.pid, signal.SIGINT)
 
     def wait(self, limit_s: float = LIMIT_S) -> Ended:
-        """Wait for the end; fail when the machine has idled for `limit_s` since."""
+        """Wait until the program has ended; fail after `limit_s` idle seconds."""
         deadline = read_idle_s() + limit_s
         while (status := self.process.poll()) is None:
             if read_idle_s() > deadline:
@@ -140,7 +138,7 @@ class Program:
             self.process.wait()
 
     def end(self) -> None:
-        """Send SIGTERM, then SIGKILL if it does not end within ten idle seconds (chosen); fails in that case."""
+        """Send SIGTERM. Fails if the program does not end within ten idle seconds, and kills it."""
         if self.process.poll() is None:
             self.process.terminate()
             self.wait(limit_s=10.0)
@@ -168,16 +166,16 @@ class Bench:
         return self.run("polysight", *arguments, limit_s=limit_s)
 
     def run_here(self, *arguments: str | Path) -> Ended:
-        """Run a host command in this process, which saves a second for starting a program."""
+        """Run a host command in this process, which saves the second in which a program starts."""
         out = io.StringIO()
         err = io.StringIO()
-        # A command may set a handler of its own, which would outlive it in this process.
+        # A command may replace the signal handler of this process.
         handler_before = signal.getsignal(signal.SIGTERM)
         try:
             with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):
                 status = main([str(word) for word in arguments])
         except SystemExit as e:
-            # The parser of arguments raises it after an error, and after a help.
+            # The parser of arguments ends the program after an error and after its help.
             status = e.code if isinstance(e.code, int) else 1
         finally:
             signal.signal(signal.SIGTERM, handler_before)
@@ -192,6 +190,6 @@ class Bench:
         return list_processes_naming(str(self.folder))
 
     def close(self) -> None:
-        """End everything, the last one first."""
+        """End all programs, the one that was started last first."""
         for program in reversed(self.programs):
             program.end()

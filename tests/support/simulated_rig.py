@@ -1,4 +1,4 @@
-"""The whole simulated rig as processes, with its Pi."""
+"""The whole simulated rig as processes: stage, radars, capture cards, and the Pi's program."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -18,7 +18,10 @@ SCENE = write_small_scene(12, 6, pulses=4, pixels=40, pixel_mm=4.0)
 
 
 class Rig(Bench):
-    """A simulated rig that runs, with its Pi; `scan` and `folder/"rig.toml"` are for the host."""
+    """A running simulated rig with its Pi.
+
+    `scan` starts a scan of the host with the rig file `config`. Times in the rig are shorter by `time_scale`.
+    """
 
     def __init__(self, folder: Path, time_scale: float, env: dict[str, str] | None, scene: str) -> None:
         super().__init__(folder)
@@ -44,7 +47,7 @@ class Rig(Bench):
         self.simulators = self.start("python", "-m", "polysight_simulators.rig", *options, env=self._env)
         base = Path(self.simulators.wait_ready())
         table = to_builtins(load_instrument(base))
-        # Short limits, so that tests of lost programs do not wait long.
+        # These limits are short, so that tests that end a program do not wait long for the error.
         table["limits"] |= {"command_timeout_s": 1.5, "end_of_record_s": 1.0}
         table["pi"]["heartbeat_ms"] = 100
         self.instrument = decode(table, Instrument, "test")
@@ -52,7 +55,7 @@ class Rig(Bench):
         self.pi = self.start_pi()
 
     def start_pi(self) -> Program:
-        """Start the Pi's program; an earlier one has ended."""
+        """Start the Pi's program, after an earlier one has ended."""
         wires = self.folder / "rig" / "wires.sock"
         self.pi = self.start("polysight-pi", "run", "--config", self.config, "--wires", wires)
         self.pi.wait_ready()
@@ -63,30 +66,32 @@ class Rig(Bench):
         return self.start("polysight", "scan", "--config", self.config, "--out", self.folder / "scan", *more)
 
     def wait_mid_row(self, scan: Program, rows: int) -> None:
-        """Wait until this number of rows is committed, and the Pi has journalled an event of the next row."""
-        # Bytes of the journal when the row had begun; 0: it has not.
-        begun = 0
+        """Wait until this number of rows is committed, and the Pi's journal has an event of the next row."""
+        # Size of the journal when the next row was seen to be running; 0 until then.
+        bytes_at_start = 0
 
-        def is_received() -> bool:
-            nonlocal begun
+        def is_mid_row() -> bool:
+            nonlocal bytes_at_start
             assert scan.process.poll() is None, f"the scan ended too early: {scan.err}"
-            journal = sum(path.stat().st_size for path in self.folder.glob("rig/journal/*.journal"))
-            if self.count_committed_rows() < rows or not any(self.folder.glob("scan/raw/*/*.part")):
-                begun = 0
-            elif not begun:
-                begun = journal
-            return 0 < begun < journal
+            journal_bytes = sum(path.stat().st_size for path in self.folder.glob("rig/journal/*.journal"))
+            # A row that is being received has files that end in `.part`.
+            is_receiving = any(self.folder.glob("scan/raw/*/*.part"))
+            if self.count_committed_rows() < rows or not is_receiving:
+                bytes_at_start = 0
+            elif not bytes_at_start:
+                bytes_at_start = journal_bytes
+            return 0 < bytes_at_start < journal_bytes
 
-        wait_for(is_received, f"row {rows} being received")
+        wait_for(is_mid_row, f"row {rows} being received")
 
     def count_committed_rows(self) -> int:
-        """Return the number of committed rows of the scan, 0 before it has begun."""
+        """Return the number of committed rows of the scan; 0 before there is a scan folder."""
         with suppress(PolysightError):
             return len(ScanFolder.load(self.folder / "scan").committed_rows())
         return 0
 
     def close(self) -> None:
-        """End all processes of this rig; fail if one is left."""
+        """End all processes of this rig; fail if one of them still runs."""
         super().close()
         remaining = self.list_processes()
         assert not remaining, remaining

@@ -1,4 +1,4 @@
-"""Requests to a served site: whole ones, raw ones, and hostile ones."""
+"""HTTP requests to a server of the live view: usual ones, and any bytes."""
 
 import hashlib
 import http.client
@@ -16,7 +16,10 @@ TOKEN = "the-right-token"
 def ask(
     view: Any, path: str, method: str = "GET", body: Any = None, **headers: str
 ) -> tuple[int, bytes, dict[str, str]]:
-    """Send a request; return status, body and headers with names in lower case. Names given have `_` for `-`."""
+    """Send a request; return status, body, and headers with names in lower case.
+
+    A `body` that is not bytes is sent as JSON. In the names of `headers` an underscore stands for a hyphen.
+    """
     connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
     raw = body if isinstance(body, bytes | None) else json.dumps(body).encode()
     try:
@@ -58,7 +61,7 @@ def _receive(s: socket.socket) -> bytes:
 
 
 def compute_digest(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of every file below a folder, and the targets of links."""
+    """Return the SHA-256 of every file below a folder, or the target of a link, by name."""
     digests = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))

@@ -23,15 +23,15 @@ from websockets.sync.client import connect
 from tests.support.paths import REPO
 from tests.support.processes import HANG_S, LIMIT_S, read_idle_s, wait_for
 
-# Sizes of a window: width and height in CSS pixels, and whether it is a phone; chosen, the phone's as a common one has.
+# Windows: width and height in CSS pixels, and True for a phone. Many phones have this size.
 DESK = (1400, 900, False)
 PHONE = (390, 844, True)
 
 
 def find_chromium() -> str | None:
-    """The browser's program; None if there is none.
+    """Path of the browser's program; None if it is not installed.
 
-    The headless shell comes first: it draws no windows, and a page takes a third of the processor time.
+    The headless shell is preferred: it cannot draw windows, and needs a third of the processor time for a page.
     """
     for program in ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome"):
         path = shutil.which(program)
@@ -49,7 +49,7 @@ def find_axe() -> Path | None:
 
 
 class NavigatedError(Exception):
-    """The page navigated during the request: repeat it."""
+    """The browser went to another page during the request, which must be repeated."""
 
 
 class Browser:
@@ -58,7 +58,7 @@ class Browser:
     Parameters
     ----------
     folder
-        For its profile.
+        Folder for the profile and the browser's log.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -68,7 +68,7 @@ class Browser:
         command = [
             program,
             "--headless=new",
-            # A container lets no program make a sandbox, and has little shared memory.
+            # In a container a program may not make a sandbox, and there is little shared memory.
             "--no-sandbox",
             "--disable-dev-shm-usage",
             "--disable-gpu",
@@ -78,7 +78,8 @@ class Browser:
         command += ["--disable-background-networking", "--disable-component-update", "--remote-debugging-port=0"]
         command += [f"--user-data-dir={profile}", "about:blank"]
         self._log = (folder / "chromium.log").open("wb")
-        # In a process group of its own: Debian's headless shell is started by a script, which would end without it.
+        # It gets a process group of its own, by which all its processes are ended: Debian starts the headless shell by
+        # a script, and a signal to the script alone would not reach it.
         self._process = subprocess.Popen(command, stdout=self._log, stderr=self._log, start_new_session=True)
         try:
             address = self._wait_for_page(profile / "DevToolsActivePort")
@@ -123,7 +124,7 @@ class Browser:
         return pages[0]
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Call a method of the protocol; events received meanwhile are processed."""
+        """Call a method of the protocol and return its result. Events that come before it are processed."""
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
         while True:
@@ -136,7 +137,7 @@ class Browser:
             self._add_event(answer.get("method", ""), answer.get("params", {}))
 
     def _add_event(self, event: str, parameters: dict[str, Any]) -> None:
-        """Keep the errors and requests among the browser's events."""
+        """Record an event if it reports an error or a request."""
         if event == "Runtime.exceptionThrown":
             exception = parameters["exceptionDetails"].get("exception", {})
             self.errors.append(str(exception.get("description")))
@@ -171,7 +172,7 @@ class Browser:
         self.open(url)
 
     def forget(self, address: str) -> None:
-        """Forget tokens and cookies of an address: another server may have had its port before."""
+        """Delete tokens and cookies of an address: an earlier server may have had the same port."""
         self.call("Storage.clearDataForOrigin", origin=address, storageTypes="all")
 
     def fill(self, selector: str, text: str) -> None:
@@ -182,13 +183,13 @@ class Browser:
         )
 
     def click(self, selector: str) -> None:
-        """Press a button that is shown."""
+        """Press a button, once it is shown and enabled."""
         element = f"document.querySelector({json.dumps(selector)})"
         self.wait(f"{element}?.checkVisibility() && !{element}.disabled", f"that {selector} can be pressed")
         self.evaluate(f"{element}.click()")
 
     def check_whole(self, address: str) -> None:
-        """Check that nothing overflows sideways, there are no errors, and nothing was loaded from another address."""
+        """Check that the page fits the window's width, has no errors, and has loaded nothing from another address."""
         assert self.evaluate("document.documentElement.scrollWidth <= innerWidth")
         assert self.errors == []
         assert all(url.startswith((address, "about:", "blob:")) for url in self.requests), self.requests
@@ -200,7 +201,8 @@ class Browser:
 
     def find_violations(self, axe: Path) -> list[list[str]]:
         """Rules of axe-core that the page breaks, each with the elements that break it."""
-        # The checker is read once a page, and names no element by a selector: that takes longer than its rules.
+        # The checker is loaded once into each page. Finding a selector for each element would take longer than the
+        # rules, so elements are shown as HTML.
         if not self.evaluate("'axe' in window"):
             self.evaluate(f"{axe.read_text(encoding='utf-8')}; 0")
         return self.evaluate(
@@ -219,14 +221,14 @@ class Browser:
         return self.evaluate(f"document.getElementById('{element}')?.innerText ?? ''")
 
     def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
-        """Wait until an expression is true in the page."""
+        """Wait until a JavaScript expression is true in the page. `what` describes it in an error."""
         deadline = read_idle_s() + limit_s
         while not self._is_true(expression):
             assert read_idle_s() < deadline, f"not within {limit_s:g} s: {what}; it says {self.read_text('status')!r}"
             time.sleep(0.05)
 
     def _is_true(self, expression: str) -> bool:
-        """True if an expression is true; False also while the page is replaced by another."""
+        """True if an expression is true; False also while the browser goes to another page."""
         try:
             return bool(self.evaluate(f"Boolean({expression})"))
         except NavigatedError:
@@ -239,16 +241,16 @@ class Browser:
 
     @property
     def process_group(self) -> int:
-        """Number of the group of all its processes."""
+        """Id of the group of all processes of the browser."""
         return self._process.pid
 
     def _end(self) -> None:
-        """End the browser with all its processes, also those whose parent has ended before them."""
+        """End all processes of the browser, also those whose parent has ended before them."""
         try:
             with suppress(ProcessLookupError):
                 os.killpg(self.process_group, signal.SIGTERM)
-            # Ten seconds, chosen; then it is killed.
-            self._process.wait(10)
+            # It is killed if it has not ended after ten seconds.
+            self._process.wait(timeout=10)
         except subprocess.TimeoutExpired:
             pass
         finally:

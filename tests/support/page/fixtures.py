@@ -1,4 +1,4 @@
-"""Small scans, and watches of them: fixtures of the rooms `page` and `serve`."""
+"""Fixtures of the test folders `page` and `serve`: small scans, and watches, which follow a scan for the live view."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -40,16 +40,16 @@ def growing(finished_scan: Path, tmp_path: Path) -> GrowingScan:
 
 
 class Watched(Watch):
-    """A watch with a method that waits for a snapshot."""
+    """A watch with a method that waits for a state of the scan."""
 
     def wait_for(self, condition: Callable[[dict[str, Any]], bool]) -> None:
-        """Wait until a snapshot meets a condition."""
+        """Wait until the condition holds for the state that the page would show."""
         wait_for(lambda: condition(json.loads(self.state.data)), "a snapshot")
 
 
 @pytest.fixture
 def watching() -> Iterator[Callable[..., Watched]]:
-    """Function that starts a `Watch`, which runs until the test ends."""
+    """A function that starts a watch, which runs until the test ends."""
     with ExitStack() as watched:
 
         def watch(*arguments: Any, **options: Any) -> Watched:
@@ -62,7 +62,7 @@ def watching() -> Iterator[Callable[..., Watched]]:
 
 @pytest.fixture(scope="session")
 def processed_scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two processed scans, `one` and `two`, of copper and PET with other noise."""
+    """A folder with two processed scans, `one` and `two`, of copper and PET; they differ in their noise."""
     scene = decode_scene(make_scene(COPPER, PET, columns=15, rows=17), "test")
 
     def make(root: Path) -> None:

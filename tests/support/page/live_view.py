@@ -1,4 +1,4 @@
-"""Helpers for tests of the live view: scans that grow on demand, and servers on free ports."""
+"""Helpers for tests of the live view: scans that grow line by line, and servers on free ports."""
 
 import shutil
 import threading
@@ -23,20 +23,20 @@ from tests.support.store.facts import load_facts
 
 
 def begin_history(started: dict[str, Any]) -> ScanHistory:
-    """Return the history of a scan of which only the first fact is there."""
+    """Return the history of a scan whose manifest has only its first line, the fact `started`."""
     content = manifest.parse(manifest.encode_line(started))
     assert content.started is not None
     return ScanHistory(content, content.started)
 
 
 def add_fact(history: ScanHistory, fact: dict[str, Any]) -> None:
-    """Write a further fact, for the history to read."""
-    for new in history.content.feed(manifest.encode_line(fact)):
-        history.add_fact(new)
+    """Add a fact to the history, as if its line were read from the manifest."""
+    for parsed_fact in history.content.feed(manifest.encode_line(fact)):
+        history.add_fact(parsed_fact)
 
 
 class GrowingScan:
-    """A copy of a finished scan whose manifest and events a test writes line by line."""
+    """A copy of a finished scan, to which a test writes the lines of the manifest one by one, as if it were running."""
 
     def __init__(self, finished: Path, folder: Path) -> None:
         self._facts = load_facts(finished)
@@ -46,11 +46,12 @@ class GrowingScan:
         shutil.copytree(finished / "raw", folder / "raw")
 
     def grow(self) -> str:
-        """Write the next fact and its events; return its name, "" if none is left."""
+        """Write the next fact of the finished scan, and the events before it; return its name, or "" at the end."""
         if not self._facts:
             return ""
         fact = self._facts.pop(0)
         fact |= {key: utc_now() for key in fact if key.endswith("_utc")}
+        # A fact has the length of the file of events at its time.
         event_bytes = fact.get("events", {}).get("bytes", 0)
         if event_bytes:
             (self.path / EVENTS).write_bytes(self._events[:event_bytes])
@@ -58,7 +59,7 @@ class GrowingScan:
         return str(fact["fact"])
 
     def write(self, fact: dict[str, Any]) -> None:
-        """Write another fact."""
+        """Write a fact that is not one of the finished scan."""
         with (self.path / MANIFEST).open("ab") as f:
             f.write(manifest.encode_line(fact))
 
@@ -68,14 +69,14 @@ class GrowingScan:
             assert self._facts, f"no {fact} left"
 
     def touch_alive(self) -> None:
-        """Touch the scan's `alive` file."""
+        """Touch the file by which a running scan shows that it is alive."""
         (self.path / CONTROL_FOLDER).mkdir(exist_ok=True)
         (self.path / CONTROL_FOLDER / ALIVE_FILE).touch()
 
 
 @contextmanager
 def open_control(folder: Path) -> Iterator[StopRequest]:
-    """Serve `folder`/control as a running scan does; yields the stop request that the commands set."""
+    """Execute the commands in `folder`/control as a running scan does; yield the stop request that they set."""
     stop = StopRequest()
     with ControlFolder(folder, stop) as control:
         control.open()
@@ -84,7 +85,10 @@ def open_control(folder: Path) -> Iterator[StopRequest]:
 
 
 class Served:
-    """A site on a free port, or at the given address; both processes' applications in one thread."""
+    """A site on a free port or at a given address.
+
+    In the program the front and the reader of scans are two processes; here both run in one thread.
+    """
 
     def __init__(
         self, site: Site, access: Access, host: str = "127.0.0.1", port: int = 0, place: ServerAddress | None = None
@@ -130,7 +134,7 @@ def serve_folder(
     config: Path | None = None,
     place: ServerAddress | None = None,
 ) -> Iterator[Served]:
-    """Serve all scans under a folder during the block; with a rig file the page can start programs."""
+    """Serve all scans in a folder during the block. With a rig file (`config`) the page can start programs."""
     access = access or Access(token, control=bool(token))
     programs = Programs() if config is not None else None
     server = Served(Site(Scans(root), Watches(access.control), programs, config), access, place=place)

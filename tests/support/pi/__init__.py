@@ -1,1 +1,1 @@
-"""Stand-ins for everything around the Pi's program, and the program as a process."""
+"""Stand-ins for the stage, the wires and the host around the Pi's program, and the program itself as a process."""

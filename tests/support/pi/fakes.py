@@ -1,4 +1,4 @@
-"""Stand-ins around the Pi's program: a stage, its driver, and trigger lines with a clock set by tests."""
+"""Stand-ins for devices of the Pi: a stage at a serial port, the driver of a stage, and the trigger lines."""
 
 import contextlib
 import math
@@ -23,7 +23,7 @@ from tests.support.processes import HANG_S
 
 
 class FakeDriver:
-    """Accepts every command and keeps the bytes sent."""
+    """A driver of the stage that accepts every command, and records the immediate bytes that were sent."""
 
     def __init__(self) -> None:
         self.config = Stage("none")
@@ -57,9 +57,10 @@ class FakeDriver:
 
 
 class FakeLines:
-    """Trigger lines with their own clock `t`, which is advanced only by sleeps, edges and changes of the output.
+    """Trigger lines with their own clock `t` (ns), which only sleeps, edges and changes of the output advance.
 
-    `late(n)`: how late the n-th sleep ends; `long(n)`: how long the n-th change of the output takes; nanoseconds.
+    `late(n)` is the delay (ns) of the end of the n-th sleep, and `long(n)` the duration of the n-th change of the
+    output.
     """
 
     name = "fake"
@@ -70,14 +71,14 @@ class FakeLines:
         self.late = late
         self.long = long
         self.check_width = True
-        # Pulses that the return wire sees of those sent; None: there is no return wire.
+        # Returns the number of pulses on the return wire for a number of sent ones. None: there is no return wire.
         self.seen: Callable[[int], int] | None = None
         self.sleeps = 0
         # Time and level of each change of the output.
         self.changes: list[tuple[int, bool]] = []
         self.level = False
         self.closed = False
-        # Edges that tests put on the trigger line; an exception is raised instead.
+        # Edges of the trigger line, in which tests put them. An exception in their place is raised.
         self.edges: queue.SimpleQueue[Edge | Exception] = queue.SimpleQueue()
 
     def now_ns(self) -> int:
@@ -124,32 +125,54 @@ class FakeLines:
 
 
 def gone() -> DeviceError:
-    """Return the error of lines whose chip vanished."""
+    """Return the error of trigger lines whose GPIO chip has disappeared."""
     return DeviceError("the chip vanished")
 
 
 STEPS_PER_MM = 200
-# Two lines of the hub, joined: when the stage hears its own change, the hub has delivered the edges before it.
+# Two joined lines of the hub of simulated wires. The stage changes the first one after its edges. When it sees that
+# change on the second one, the hub has delivered the edges.
 MARK_LINE = 1000
 ECHO_LINE = 1001
-# Acceleration, steps/s^2.
+# Acceleration, steps/s^2
 ACCEL = 40000
+# Immediate bytes are outside of ASCII.
+FIRST_IMMEDIATE_BYTE = 0x80
 
 
-def _rest_after(row: Command) -> tuple[int, int]:
-    """Position of the stage after ROW (docs/spec/stage-line.md), without backlash."""
-    x0, dx, points, y, feed = row.args
-    run_up = math.ceil(feed**2 / (2 * ACCEL)) + abs(dx)
-    return x0 + (points - 1) * dx + (run_up if dx > 0 else -run_up), y
+def _find_rest_position(row: Command) -> tuple[int, int]:
+    """Position in steps at which the stage rests after ROW (docs/spec/stage-line.md), without backlash."""
+    x_start, dx, points, y, feed = row.args
+    # Way in which the stage slows down after the last point
+    run_out = math.ceil(feed**2 / (2 * ACCEL)) + abs(dx)
+    last_x = x_start + (points - 1) * dx
+    if dx > 0:
+        return last_x + run_out, y
+    return last_x - run_out, y
 
 
 class FakeStage:
-    """A stage behind a pty: speaks the stage line, raises the trigger on simulated wires.
+    """A stage at a pseudo terminal that speaks the stage's protocol, and raises the trigger on simulated wires.
 
-    Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
-    answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `stays_after` (a row
-    stops after so many points until that changes), `alarm_at` (alarm number at a point), `lost` (steps that homing
-    finds lost), `row_end` (where a row ends), `pace_s` (wall time from point to point).
+    Attributes
+    ----------
+    deaf
+        The stage answers nothing.
+    lose, damage, lose_end
+        Number of received lines that it ignores, of replies that it sends with a wrong byte, and of reports of a
+        motion's end (done or alarm) that it does not send.
+    skip
+        Points of a row at which it raises no trigger.
+    stays_after
+        A row stops after this number of points until the attribute changes.
+    alarm_at
+        Number of the alarm that stops a row at a point, by point.
+    lost
+        Lost steps in x and y that it reports after homing.
+    row_end
+        Position at which a row ends, if it is not the right one.
+    pace_s
+        Time from point to point by the clock.
     """
 
     def __init__(self, hub: Path | None, trigger: int = 26) -> None:
@@ -186,7 +209,7 @@ class FakeStage:
         self._thread.start()
 
     def unplug(self) -> None:
-        """The cable is pulled: the port reports an error."""
+        """Unplug the cable: the port reports an error."""
         self._closed.set()
         self._stopping.set()
         self._thread.join()
@@ -202,7 +225,7 @@ class FakeStage:
             self.wire.close()
 
     def say(self, reply: Reply) -> None:
-        """Send a reply, garbled if an answer is to be."""
+        """Send a reply; with a wrong byte if it is an answer to a command and `damage` is not 0."""
         raw = reply.encode()
         if self.damage and reply.kind in ("ok", "error"):
             self.damage -= 1
@@ -236,10 +259,9 @@ class FakeStage:
             if not events & select.POLLIN:
                 continue
             for c in os.read(self.master, 4096):
-                # Immediate bytes are outside of ASCII; 10 is the end of a line.
-                if c >= 0x80:
+                if c >= FIRST_IMMEDIATE_BYTE:
                     self._immediate(c)
-                elif c == 10:
+                elif c == ord("\n"):
                     self._line(buffer + b"\n")
                     buffer = b""
                 else:
@@ -317,11 +339,11 @@ class FakeStage:
             self._motion.start()
 
     def _move(self, c: Command) -> None:
-        """Run a motion in a thread of its own, and report its end unless that is to be lost."""
+        """Run a motion in a thread of its own, and report its end, unless `lose_end` is not 0."""
         try:
             number = self._run_row(c) if c.verb == "ROW" else self._run_other_motion(c)
         except PolysightError:
-            # The hub of the wires was closed.
+            # The hub of the simulated wires was closed.
             return
         self.moving = self.held = False
         if self._closed.is_set():
@@ -348,12 +370,12 @@ class FakeStage:
         return 0
 
     def _run_row(self, c: Command) -> int:
-        """Pass the points of a row, with the wrong behaviour that is requested; return an alarm's number or 0."""
-        x0, dx, n, self.y, feed = c.args
+        """Move along the points of a row, with the faults that the test has set; return an alarm's number or 0."""
+        x_start, dx, points, self.y, feed = c.args
         self.rows_run += 1
         step_ns = abs(dx) * 10**9 // feed
         self.points = 0
-        for i in range(n):
+        for i in range(points):
             self.t_ns += step_ns
             if self._stopping.wait(self.pace_s):
                 return StageError.STOPPED
@@ -362,7 +384,7 @@ class FakeStage:
                     return StageError.STOPPED
             if i in self.alarm_at:
                 return self.alarm_at.pop(i)
-            self.x = x0 + i * dx
+            self.x = x_start + i * dx
             self.points += 1
             if i not in self.skip:
                 self._edge(self.t_ns)
@@ -372,13 +394,13 @@ class FakeStage:
         # The stage passes the last point and slows down.
         if self._stopping.wait(2 * self.pace_s):
             return StageError.STOPPED
-        self.x, self.y = self.row_end or _rest_after(c)
+        self.x, self.y = self.row_end or _find_rest_position(c)
         return 0
 
     def _edge(self, t_ns: int) -> None:
-        """Raise the trigger for 20 us of wire time."""
+        """Raise the trigger for 20 microseconds of the wires' time."""
         if self.wire:
             edges = WireEdge(t_ns, self.trigger, 1), WireEdge(t_ns + 20_000, self.trigger, 0)
             self.wire.send(*edges, WireEdge(t_ns, MARK_LINE, 1))
-            # A wire has no delay: the edge has left the hub before the stage sends the next line.
+            # Wait until the hub has delivered the edges: a wire has no delay, so they must come before the next line.
             self.wire.receive(HANG_S)

@@ -1,4 +1,4 @@
-"""A minimal host: its end of the Pi's sockets."""
+"""A minimal host that sends commands to the Pi's program and receives its events, and that program in a thread."""
 
 import threading
 import time
@@ -20,15 +20,15 @@ from polysight_shared.sockets import create_requester, create_subscriber
 from tests.support.processes import LIMIT_S, read_idle_s, wait_for
 
 POLL_MS = 100
-# Step of the ticking clock.
+# Step of the ticking clock
 TICK_S = 0.01
 
 
 class TickingClock:
-    """The clock of the Pi's program in this process: a thread advances it by `TICK_S` in each of its turns.
+    """The clock of the Pi's program in this process, which a thread of this process advances by `TICK_S` at a time.
 
-    So nothing is late because a busy machine gives the process little processor time. It does not advance while
-    `stands` is True.
+    On a busy machine the process gets little processor time, and its clock is slow as well, so that no event is late.
+    The clock stands still while `stands` is True.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class TickingClock:
 
 
 class HostSide:
-    """Sends commands, and keeps every event in `events`."""
+    """Sends commands to the Pi, and records every event in `events`."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class HostSide:
         self.subscriber = create_subscriber(self.context, event_address, key_dir)
         self.instrument = instrument
         self.events: list[Any] = []
-        # Once an event comes, the subscription has arrived.
+        # When the first event comes, the Pi has received the subscription.
         self.wait_for_event(object)
 
     def ask(self, command: Any) -> Any:
@@ -133,7 +133,7 @@ class HostSide:
     def wait_for_event(
         self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None
     ) -> Any:
-        """The next event of a kind."""
+        """Wait for the next event of a kind, for which `where` is true if it is given; return it."""
         limit_s = self.limit_s if limit_s is None else limit_s
         deadline = read_idle_s() + limit_s
         while read_idle_s() < deadline:
@@ -174,7 +174,8 @@ class Running:
         self.clock = TickingClock()
         self.service = Service(instrument, wires)
         self.service.executor._machine._clock = self.clock
-        # The memory of this process is that of the tests, too: without a limit the watch cuts no connection for it.
+        # The program closes connections when its process has too much memory. Here that is the tests' memory, too, so
+        # the limit is raised to a terabyte.
         self._without_limit = patch.object(system, "MAX_BYTES", 1 << 40)
         self._without_limit.start()
         self.thread = threading.Thread(target=self.service.serve)

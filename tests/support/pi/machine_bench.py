@@ -1,4 +1,4 @@
-"""The state machine with a stage, a trigger loop and a journal that tests control, with a clock that they set."""
+"""The Pi's state machine with a stage, a trigger loop, a journal and a clock that a test controls step by step."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ class FakeJournal:
 
 
 class Bench:
-    """A machine with a fake stage and journal, and a trigger loop whose edges the test gives."""
+    """The state machine with a fake stage and journal, and a trigger loop whose edges come from the test."""
 
     def __init__(self) -> None:
-        # The machine's clock, seconds; its start is chosen.
+        # Time of the machine's clock, seconds
         self.t = 100.0
         self.lines = FakeLines()
         self.stage = FakeDriver()
         self.journal = FakeJournal()
-        # What the machine and the trigger loop give to the executor: results of bursts, faults, and calls.
+        # Items that the machine and the trigger loop send to the executor: sent bursts, faults, and functions to call.
         self.posted: list[Any] = []
-        # Its thread is not started: the test gives edges to it.
+        # The thread of the loop is not started: the test passes edges to it.
         self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)
         parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)
         self.machine = Machine(*parts)
@@ -51,7 +51,7 @@ class Bench:
         self.row = ROW
 
     def run_posted(self) -> None:
-        """Execute the items that machine and trigger loop have posted, as the executor does."""
+        """Process all posted items, as the executor does."""
         while self.posted:
             item = self.posted.pop(0)
             if isinstance(item, BurstSent):
@@ -62,7 +62,7 @@ class Bench:
                 item()
 
     def let_time_pass(self, seconds: float) -> None:
-        """Advance the time in the executor's turns, until something is due or the time is over."""
+        """Advance the clock from deadline to deadline, as the executor does, and let the machine check each of them."""
         end = self.t + seconds
         while self.t < end:
             seconds_to_deadline = self.machine.seconds_left()
@@ -100,18 +100,21 @@ class Bench:
         self.send_reply(Reply("status", fields=fields, **times_ns))
 
     def end_row(self, dx: int = 0, dy: int = 0, held: int = 0, extra_pulses: int = 0, **times_ns: int) -> None:
-        """The stage ends the row, this many steps from its end position, with so many additional trigger pulses."""
+        """Send the stage's report that the row has ended.
+
+        It rests `dx` and `dy` steps from the right position, and has sent `extra_pulses` more triggers than points.
+        """
         x, y = RowMotion.plan(self.row, self.stage.config, 20.0).end
         fields = {"points": str(self.row.points), "pulses": str(self.row.points + extra_pulses)}
         fields |= {"x": str(x + dx), "y": str(y + dy), "held": str(held)}
         self.send_reply(Reply("done", self.stage.number, fields=fields, **times_ns))
 
     def send_edge(self) -> None:
-        """Send the next edge at its right time."""
+        """Send the next edge at the time at which it is expected."""
         self.give_edge(self.edge_ns + INTERVAL_NS)
 
     def give_edge(self, t_ns: int) -> None:
-        """Send an edge to the trigger loop, and its results to the machine."""
+        """Pass an edge at this time to the trigger loop, and the results to the machine."""
         self.seqno += 1
         self.edge_ns = t_ns
         self.lines.t = max(self.lines.t, t_ns)

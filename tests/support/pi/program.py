@@ -1,4 +1,4 @@
-"""`polysight-pi` as a process, and a record of everything on the given wires."""
+"""The Pi's program `polysight-pi` as a process, and a recorder of the edges on simulated wires."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PROGRAM = (sys.executable, "-m", "polysight_pi")
 
 
 class Process:
-    """`polysight-pi run`, once it is ready; with further arguments and environment variables.
+    """`polysight-pi run`, with further arguments and environment variables. The object is made when it is ready.
 
     `ready_line` and `events_line` are the words of its first two lines: `ready` with the address for commands, and
     `events` with that of the events.
@@ -60,7 +60,7 @@ class Process:
 
 
 def require_stand_in_chip() -> None:
-    """Skip the module where the stand-in GPIO chip cannot be used."""
+    """Skip the module if the emulated GPIO chip cannot be used on this machine."""
     pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
     if lacking := gpio.list_missing_packages():
         pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}", allow_module_level=True)

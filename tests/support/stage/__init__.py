@@ -1,1 +1,1 @@
-"""Stages with one interface, written dialogues, and a host at the emulated UNO."""
+"""Stages of all kinds with the same interface, conversations with them from text files, and stages as processes."""

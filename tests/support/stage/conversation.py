@@ -1,4 +1,4 @@
-"""Plays a written conversation (syntax: test_dialogues.py) with a stage."""
+"""Play a conversation with a stage from a text file; tests/stage/test_dialogues.py describes its syntax."""
 
 import ast
 import re
@@ -64,7 +64,7 @@ class Conversation:
         )
 
     def act(self, text: str) -> None:
-        """Let time pass, press switches, slip or reset the stage."""
+        """Let time pass, press switches, let the motors lose steps, or reset the stage."""
         words = text.split()
         if words[-1] == "ms":
             self.stage.run_ms(float(words[0]))
@@ -81,7 +81,7 @@ class Conversation:
 
 
 def play(stage, path: Path) -> None:
-    """Play every line of the file; fail at the first one that does not match."""
+    """Play every step of the file; fail at the first line of the stage that differs."""
     conversation = Conversation(stage)
     for number, sign, texts in _steps(path):
         try:
@@ -98,16 +98,19 @@ def play(stage, path: Path) -> None:
 
 
 def _steps(path: Path) -> list[tuple[int, str, list[str]]]:
-    """Line number, sign and texts of every step; consecutive lines to send are one step."""
+    """Line number, sign and texts of every step. Consecutive lines to send (`->`) are one step, sent together."""
     steps: list[tuple[int, str, list[str]]] = []
     for number, line in enumerate(path.read_text(encoding="ascii").splitlines(), 1):
         line = line.partition(" //")[0].strip()
         if not line or line.startswith("//"):
             continue
+        # Two characters, a space and the text
         sign = line[:2]
         text = line[3:].strip()
-        if sign == "->" and steps and steps[-1][1] == sign:
-            steps[-1][2].append(text)
-        else:
-            steps.append((number, sign, [text]))
+        if steps:
+            _, last_sign, last_texts = steps[-1]
+            if sign == last_sign == "->":
+                last_texts.append(text)
+                continue
+        steps.append((number, sign, [text]))
     return steps

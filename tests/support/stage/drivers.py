@@ -1,4 +1,8 @@
-"""One interface for every stage: sketch on this machine, Python stand-in, machine code on an emulated UNO, a port."""
+"""The same interface for stages of all kinds.
+
+A stage is the Arduino sketch compiled for this machine, its stand-in in Python, the machine code of the sketch on an
+emulated Arduino UNO, or a real stage at a serial port. The same tests run on all of them.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,8 @@ from polysight_simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
 from polysight_simulators.uno import HZ, EmulatedUno, PinEdge
 from tests.support.processes import HANG_S, LIMIT_S, read_idle_s
 
-# Longest time until a stage comes to rest: 10 minutes; chosen.
-LIMIT_TICKS = 600 * TICK_HZ
+# A stage must come to rest within 10 minutes.
+LIMIT_TICKS = 10 * 60 * TICK_HZ
 TICKS_PER_MS = TICK_HZ // 1000
 
 
@@ -31,10 +35,10 @@ def list_motions(wires: list[WireMessage]) -> list[WireMotion]:
 
 
 class Driver:
-    """Sends lines, advances the time, and collects the replies.
+    """Sends lines to a stage, advances its time, and collects its replies.
 
-    Each kind has `send` (bytes to the stage), `run` (ticks), `rest` (until nothing moves), `press` (mask of switches),
-    `slip` (steps lost in x and y) and `reset`.
+    Each kind of stage has `send` (bytes to the stage), `run` (for a number of ticks), `run_until_rest`, `press`
+    (switches, as a bit mask), `slip` (the motors lose steps in x and y) and `reset`.
     """
 
     def __init__(self) -> None:
@@ -51,7 +55,7 @@ class Driver:
         assert is_met(), f"received {self.received!r}"
 
     def collect_late_bytes(self) -> None:
-        """Wait for bytes still under way. In virtual time there are none."""
+        """Wait for bytes that have been sent but not received. In virtual time there are none."""
 
     def has_stood_still(self) -> bool:
         """True if nothing has moved and no trigger was sent since the last call."""
@@ -74,14 +78,17 @@ class Driver:
         return Command(self.sequence, verb, args).encode()
 
     def send_command(self, verb: str, *args: int) -> Reply:
-        """Send the next command and return its only answer."""
+        """Send the next command, to which the stage must send exactly one reply; return it."""
         self.send(self.encode_command(verb, *args))
         (reply,) = self.read_replies()
         assert reply.sequence == self.sequence
         return reply
 
     def run_motion(self, verb: str, *args: int) -> tuple[Reply, list[WireMessage]]:
-        """Send a valid motion command, wait for its end; return the last reply and the changes of the wires."""
+        """Send a motion command, which must be accepted, and wait for its end.
+
+        Returns the last reply, and the edges and motions on the wires.
+        """
         self.wires.clear()
         reply = self.send_command(verb, *args)
         assert reply.kind == "ok", reply
@@ -90,7 +97,7 @@ class Driver:
         return last, list(self.wires)
 
     def ask_status(self) -> Reply:
-        """Ask for the status; everything else that was received is kept."""
+        """Request the status and return it; everything else that was received is kept for later."""
         messages_before = self.received
         self.received = b""
         self.send(bytes([Immediate.STATUS]))
@@ -100,7 +107,7 @@ class Driver:
         return Reply.decode(status)
 
     def resynchronise(self) -> None:
-        """Greet again and drop everything received before the answer."""
+        """Send HELLO, and drop everything that was received before its reply."""
         hello = self.encode_command("HELLO")
         answer = b"ok N%d " % self.sequence
         self.send(b"\n" + hello)
@@ -108,7 +115,10 @@ class Driver:
         *_, self.received = self.received.partition(answer)[2].partition(b"\n")
 
     def prepare(self, heartbeat_ms: int = 60_000) -> Driver:
-        """Greet the stage, set its heartbeat (by default a minute: none is sent), switch it on and home it."""
+        """Send HELLO, set the heartbeat timeout, switch the motors on and home the stage.
+
+        By default the timeout is a minute of the stage's time, so that tests need not send heartbeats.
+        """
         self.read_replies()
         answers = [
             self.send_command("HELLO"),
@@ -222,7 +232,7 @@ class PythonDriver(Driver):
 
 
 class UnoDriver(Driver):
-    """The compiled sketch on an emulated UNO, its serial line through a pseudo terminal, in the board's own time."""
+    """The compiled sketch on an emulated UNO in its own time, with a pseudo terminal as the serial line."""
 
     def __init__(self, program: Path, image: Path, folder: Path) -> None:
         super().__init__()
@@ -283,9 +293,8 @@ class UnoDriver(Driver):
 class PortDriver(Driver):
     """A stage behind a real serial port, in its own time.
 
-    `speed`: rate of the stage's time relative to the wall clock; 1 for a real one. Steps that need hands on switches
-    are skipped. Expected replies are awaited without limit; only the check that none comes has a time. The
-    heartbeat is sent only if the conversation sends it.
+    `speed` is the rate of the stage's time relative to the clock; 1 for a real stage. Tests that press switches or stop
+    the motors by hand are skipped.
     """
 
     def __init__(self, port: str, speed: float = 1.0) -> None:
@@ -358,7 +367,7 @@ class PortDriver(Driver):
 
 
 class Host(Driver):
-    """A host at the serial line of an emulated UNO, in lockstep; `uno` has the edges of the watched pins."""
+    """A host that shares the time of an emulated UNO, at its serial line; `uno` records the edges of watched pins."""
 
     def __init__(self, uno: EmulatedUno) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Simulated stages as processes, with a listener at their wires or a hub."""
+"""Simulated stages as processes, whose trigger edges are recorded by the test or sent to a hub of simulated wires."""
 
 import signal
 import socket
@@ -59,7 +59,7 @@ class StageProcess:
         return [m for m in self.messages if isinstance(m, WireMotion)]
 
     def end(self, number: int = signal.SIGTERM) -> list[WireMessage]:
-        """End it with a signal; return all messages of the wires."""
+        """End the stage with a signal; return all messages that were on its wires."""
         self.process.send_signal(number)
         assert self.process.wait(HANG_S) == 0
         self._listener.join(HANG_S)
@@ -73,12 +73,13 @@ class StageProcess:
             self._listener.join(HANG_S)
 
 
-# A process that starts the command of its further arguments, gives it its first argument as input, prints its number,
-# and waits to be killed.
+# A program that runs a command, prints the process id of that child, and waits to be killed. Its first argument is the
+# input of the child, and the others are the command. It waits for a line of the child, because the child learns who
+# its parent is while it starts.
 PARENT = """
 import subprocess, sys, time
 child = subprocess.Popen(sys.argv[2:], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-child.stdout.readline()  # it has started: before that it cannot know its parent
+child.stdout.readline()
 child.stdin.write(sys.argv[1].encode())
 child.stdin.flush()
 print(child.pid, flush=True)
@@ -102,9 +103,9 @@ def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "")
 
 
 def runs(pid: int) -> bool:
-    """True if there is such a process and it has not ended."""
+    """True if there is a process with this id that has not ended."""
     try:
-        # proc_pid_stat(5): the state comes after the name in brackets; Z is a process that has ended.
+        # In proc_pid_stat(5) the state comes after the name in brackets. Z is a process that has ended.
         fields_after_name = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
         return fields_after_name[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):

@@ -502,8 +502,7 @@ def judge_fringes(probability: float, has_gaps: bool = False, behind: float = 0.
     return [reason(
         "care", what,
         "a second path in addition to the direct path (multipath) or an overdriven receiver changes the gains; "
-        "bright edges of "
-        "the plates, and a table that shines through them, look alike",
+        "bright edges of the plates, and a table that shines through them, look alike",
         "take reflectors away from the line between transmitter and receivers; cover objects behind the plates with "
         "absorber", weight=3.0,
     )]  # fmt: skip
@@ -592,8 +591,7 @@ def judge_flatness(
         return []
     cause = (
         "uneven plates or bright edges, a second path in addition to the direct path, interference, or a small "
-        "aperture "
-        "cause this"
+        "aperture cause this"
     )
     action = "use even plates; take reflectors away from the line between transmitter and receivers; scan a larger area"
     if has_gaps:

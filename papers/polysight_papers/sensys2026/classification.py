@@ -254,17 +254,19 @@ def fig18(run: Run) -> Item:
         "fig18",
         "Fig. 18: classification of solids, liquids and powders",
         (
-            "Published beside simulated. The paper does not say how training and test pixels were kept apart; its"
-            " numbers fit a split by pixel, which lets a patch know itself and is optimistic. With whole scans left"
-            " out, no pixel of a test scan was ever trained on. The column “H, simulated” is by pixel, as that is"
-            " what the noise was set on; it differs from the published one by the chance of another draw.",
+            "Published beside simulated. The paper does not say how training and test pixels were kept apart; its "
+            "numbers fit a split by pixel, which is optimistic: pixels of one patch are then in both sets. With "
+            "whole scans left out, no pixel of a test scan was ever trained on. The column “H, simulated” is by "
+            "pixel, as that is what the noise was set on; it differs from the published one by the chance of another "
+            "draw.",
             "The KNN's weights λ_H, λ_V, λ_P are fitted on the training pixels of every fold, whole scans left out"
             " there too.",
-            "“Pixel alone” knows nothing but the pixel. “Scan known”: the scan's other patches are looked at too, by"
-            " their features, not their names; from them the error of the metal reference is found, which they all"
-            " share. “By patch” names a patch from the mean of its pixels as well; each pixel counts as its patch.",
+            "“Pixel alone” uses only the pixel. “Scan known” also uses the features of the scan's other patches, "
+            "but not their names: they show the error of the metal reference, which they all share. “By patch” also "
+            "uses the mean of a patch's pixels; each pixel counts as its patch.",
             noise_text(TASKS, run.quick),
-            "Nine liquids where the paper counts eight: Table 2 lists nine, and which one it left out is not said.",
+            "Nine liquids where the paper counts eight: Table 2 lists nine, and the paper does not say which one it "
+            "left out.",
         ),
         (
             Table("Share of pixels named right, mean over materials", head, tuple(s.row() for s in scores)),
@@ -313,8 +315,8 @@ def fig20(run: Run) -> Item:
         (
             "The order is the paper's: H, then V, then P, and all three together best. In this simulation V and P alone"
             " do better than published: their errors are only those the paper states, while the rig has more (uneven"
-            " illumination, leakage, thickness). How much of V's and P's advantage survives on the rig, only the rig"
-            " can tell.",
+            " illumination, leakage, thickness). Only measurements with the rig can show how much of this advantage "
+            "remains.",
             "Mean over the materials of the three groups, each classified among its own group; the paper does not say"
             " how its mean was taken.",
         ),

@@ -116,7 +116,10 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
     scans = _read_all(materials.read_labelled_scan, materials.label_folders(folder / "labels"), notices)
     if scans:
         orientation = materials.image_orientation(scans)
-        notices.append(f"boxes of labels/ are read with {orientation}: so they explain the images' brightness best")
+        notices.append(
+            f"boxes of labels/ are read with {orientation}: with this orientation they explain the "
+            "images' brightness best"
+        )
         turned = [s.orient(orientation) for s in scans]
         angles = {s.scan: _find_angle(folder, s, base, notices) for s in scans}
         entries_by_source[LABELS] = _make_entries(turned, angles, notices)

@@ -195,8 +195,8 @@ FIG18_HEAD = (
     "materials in two scans or more",
 )
 FIG18_NOTES = (
-    "The paper does not say how training and test pixels were kept apart; its numbers fit a split by pixel,"
-    " which lets a patch know itself and is optimistic. With whole scans left out no pixel of a test scan was"
+    "The paper does not say how training and test pixels were kept apart; its numbers fit a split by pixel, which "
+    "is optimistic: pixels of one patch are then in both sets. With whole scans left out no pixel of a test scan was"
     " trained on; only materials that two scans or more hold can be judged so (last column), and a dash stands"
     " where these, or the scans, are too few.",
     "Solids and powders are taken at 60 degrees, liquids at 55; the second angle is 55. Two angles: scans in"
@@ -566,10 +566,11 @@ def authors_table2(data: AuthorsData) -> Item:
             "Three ways from the same pixels. “Eq. 3”: the median of V/H relative to metal, as it is in the files."
             f" “Without leakage”: the rig file's cross-polar amplitude, {leakage:g}, is taken out first."
             f" “Authors' recipe”: leakage {AXIAL_RATIO:g}, |P| times {METAL_FACTOR:g}, the pixels between the"
-            f" {PERCENTILES[0]}th and the {PERCENTILES[1]}th percentile of |P|, mean of Eq. 3 over them. Images made"
-            " here have their leakage out already: neither takes it out again. ± is the standard error of one patch.",
-            "The recipe's factor makes up for something in the published measurements that is not explained; on data"
-            " without it, simulated data for one, the recipe is off by it.",
+            f" {PERCENTILES[0]}th and the {PERCENTILES[1]}th percentile of |P|, mean of Eq. 3 over them. Leakage "
+            "was already removed from images made here, and is not removed again. ± is the standard error of one "
+            "patch.",
+            "The recipe's factor compensates an effect in the published measurements that is not explained; on data "
+            "without this effect, such as simulated data, the recipe is wrong by this factor.",
         ),
         tuple(
             Table(f"Permittivity from {source}", HEAD, tuple(map(_format_row, e))) for source, e in estimates.items()

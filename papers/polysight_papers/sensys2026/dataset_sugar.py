@@ -15,8 +15,8 @@ from polysight_shared.errors import DataError, ErrorCode
 
 FIG21_NOTE = (
     "A straight line from the polarisation angle to the concentration, each concentration estimated by a line"
-    " through the others. The paper does not say whether its line had seen the concentration it was asked for;"
-    " the last row is for a line that has."
+    " through the others. The paper does not say whether its line was fitted to the estimated concentration, too; "
+    "the last row is for a line that was."
 )
 
 

@@ -289,8 +289,8 @@ def _spread_deg(values: npt.NDArray[np.complexfloating]) -> float:
 FIG14_NOTE = (
     "Water, oil and metal; everything outside their interiors is masked. In the paper the phases of H and V"
     " change over a target, because it is not parallel to the plane of the scan, and the phase of P does not."
-    " In this simulation the plane is parallel, so H and V are steady as well; what tells the materials apart"
-    " is the phase of P, in both."
+    " In this simulation the plane is parallel, so H and V are steady as well; in both, the phase of P "
+    "distinguishes the materials."
 )
 
 

@@ -214,10 +214,10 @@ def table2_item(run: item.Run) -> item.Item:
         "table2",
         "Table 2: permittivity of 36 materials",
         (
-            "The published values are put in as the truth, so agreement shows that the method recovers what is there"
-            " under the noise, and with which error bar; it is not a second measurement of these materials. Metal has"
-            " no determinable permittivity; the published one is a division by nearly nothing. Cork's loss is not in"
-            " the paper and is taken as zero.",
+            "The published values are put in as the truth, so agreement shows that the method finds the true value "
+            "in spite of the noise, and with which error bar; it is not a second measurement of these materials. "
+            "Metal has no determinable permittivity; the published value is a division by nearly zero. Cork's loss "
+            "is not in the paper and is taken as zero.",
             f"Furthest from the truth: {worst['name']}, {100 * worst['relative_error']:.1f} % of |ε|.",
         ),
         (

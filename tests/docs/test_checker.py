@@ -1,4 +1,7 @@
-"""The checker reports faults of a page with their places, and nothing else."""
+"""`python -m docs.check` finds faults of a page (dead links, wrong commands and code) and can run its commands.
+
+It reports each fault with its line, and nothing on a page without faults.
+"""
 
 import signal
 import subprocess
@@ -13,16 +16,19 @@ from docs.check.running import run_page
 from tests.support.processes import wait_for
 from tests.support.stage.processes import runs
 
+from polysight_shared.errors import ConfigError
+
 
 def make_page(tmp_path, text):
+    """A page with this text, next to a page with three headings."""
     path = tmp_path / "page.md"
     path.write_text(text, encoding="utf-8")
     (tmp_path / "other.md").write_text("# Two words, `code` and more\n\n## Again\n\n## Again\n", encoding="utf-8")
     return read_page(path)
 
 
-# A page with links, commands and blocks of all kinds, all of them right.
-SOUND = """# Page
+# A page with links, commands and blocks of all kinds, without a fault.
+PAGE_WITHOUT_FAULTS = """# Page
 
 [there](other.md), [part](other.md#two-words-code-and-more), [second](other.md#again-1), [here](#page), [out](https://a.b/c)
 
@@ -63,8 +69,8 @@ trigger_in = 26
 """
 
 
-def test_a_sound_page_has_no_faults(tmp_path):
-    assert page_faults(make_page(tmp_path, SOUND)) == []
+def test_no_faults_are_found_on_a_page_without_faults(tmp_path):
+    assert page_faults(make_page(tmp_path, PAGE_WITHOUT_FAULTS)) == []
 
 
 @pytest.mark.parametrize(
@@ -97,27 +103,27 @@ def test_a_sound_page_has_no_faults(tmp_path):
     ],
 )
 def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
-    faults = page_faults(make_page(tmp_path, f"# Page\n\n{text}\n"))
-    assert len(faults) == 1
-    assert fault in faults[0]
-    # The text begins in line 3. A mark takes one line before the block, and the fault of a block is reported at its
-    # first line or at the command in it.
-    line = int(faults[0].split(":")[1])
+    (report,) = page_faults(make_page(tmp_path, f"# Page\n\n{text}\n"))
+    assert fault in report
+    _, line, *_ = report.split(":")
+    # The text begins in line 3, or in line 4 after a comment that marks the block. The fault of a block is reported at
+    # its first line or at the command in it.
     first_line = 4 if text.startswith("<!--") else 3
-    assert line in (first_line, first_line + 1)
+    assert int(line) in (first_line, first_line + 1)
 
 
 def make_folder(tmp_path):
-    """A folder to run in, and the runner's folder next to it."""
+    """A folder in which commands run. The runner makes another folder next to it."""
     copy = tmp_path / "scratch/copy"
     copy.mkdir(parents=True)
     return copy
 
 
-def test_a_failing_command_is_named_by_its_line(tmp_path):
+def test_the_line_of_a_failing_command_is_reported_and_no_later_command_runs(tmp_path):
     copy = make_folder(tmp_path)
-    run = run_page(make_page(tmp_path, "# Page\n\n```sh\ntrue\n\necho seen\nls /gone\ntouch never\n```\n"), copy)
-    assert run.failed_line == 7
+    lines = ["# Page", "", "```sh", "true", "", "echo seen", "ls /gone", "touch never", "```"]
+    run = run_page(make_page(tmp_path, "\n".join(lines) + "\n"), copy)
+    assert run.failed_line == lines.index("ls /gone") + 1
     assert "seen" in run.output
     assert not (copy / "never").exists()
 
@@ -127,35 +133,36 @@ def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
     assert run.failed_line
 
 
-def test_the_commands_of_a_page_end_with_the_check(tmp_path):
-    """They do so when the check itself is terminated, too."""
-    pid = tmp_path / "pid"
-    make_page(tmp_path, f"# Page\n\n```sh\necho $$ > {pid}.part\nmv {pid}.part {pid}\nsleep 10000\n```\n")
+def test_the_commands_of_a_page_end_if_the_check_is_terminated(tmp_path):
+    pid_file = tmp_path / "pid"
+    commands = f"echo $$ > {pid_file}.part\nmv {pid_file}.part {pid_file}\nsleep 10000"
+    make_page(tmp_path, f"# Page\n\n```sh\n{commands}\n```\n")
     check = subprocess.Popen(
         [sys.executable, "-m", "docs.check", "--run", str(tmp_path / "page.md")],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    while not pid.exists():
+    while not pid_file.exists():
         assert check.poll() is None
         time.sleep(0.05)
     check.terminate()
     assert check.wait() == 128 + signal.SIGTERM
-    # Orphans of a killed program stay until the system's first process has awaited them.
-    commands = int(pid.read_text())
-    wait_for(lambda: not runs(commands), "the page's commands end with the check")
+    # A process whose parent was killed remains in the table of processes until the system's first process removes it.
+    shell_pid = int(pid_file.read_text())
+    wait_for(lambda: not runs(shell_pid), "the page's commands end with the check")
 
 
-def test_a_block_that_ends_at_a_line_with_less_indentation_is_found(tmp_path):
-    """In a list such a line ends the block; the next fence begins another one, and what follows is shown as code."""
-    faults = page_faults(make_page(tmp_path, "# Page\n\n1. a\n\n   ```toml\n   x = 1\ny = 2\n   ```\n\n## Next\n"))
-    assert len(faults) == 1
-    assert ":10: a heading in a code block" in faults[0]
+def test_a_block_in_a_list_that_ends_at_a_line_with_too_little_indentation_is_a_fault(tmp_path):
+    """The line `y = 2` ends the block, so that the closing fence begins another one: the heading is shown as code."""
+    lines = ["# Page", "", "1. a", "", "   ```toml", "   x = 1", "y = 2", "   ```", "", "## Next"]
+    (report,) = page_faults(make_page(tmp_path, "\n".join(lines) + "\n"))
+    heading_line = lines.index("## Next") + 1
+    assert f":{heading_line}: a heading in a code block" in report
 
 
 def test_a_page_that_does_not_exist_is_a_usage_error(tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as exit_info:
         main([str(tmp_path / "nope.md")])
-    assert ended.value.code == 2
+    assert exit_info.value.code == ConfigError.exit_status
     assert "nope.md is not a page" in capsys.readouterr().err

@@ -1,6 +1,7 @@
-"""README and docs: their links lead somewhere, and the commands they show exist."""
+"""README and the pages in docs: links, commands, numbers and code on them agree with the files and programs."""
 
 import re
+import signal
 import tomllib
 
 import numpy as np
@@ -19,15 +20,22 @@ from polysight_shared.faults import EXPLANATIONS, PiFault
 from polysight_simulators.scene import decode_scene, simulate
 
 
-def test_links_of_all_pages_lead_somewhere_and_their_commands_exist():
-    faults = [fault for path in all_pages() for fault in page_faults(read_page(path))]
+def test_links_of_all_pages_have_a_target_and_their_commands_exist():
+    faults = []
+    for path in all_pages():
+        faults += page_faults(read_page(path))
     assert not faults, "\n".join(faults)
 
 
-def test_every_page_is_found_from_the_index():
-    linked = {(ROOT / "docs" / t.partition("#")[0]).resolve() for _, t in read_page(ROOT / "docs/README.md").links}
-    pages = {p for folder in ("how-to", "spec", "decisions") for p in (ROOT / "docs" / folder).glob("*.md")}
-    assert not {p.name for p in pages - linked}
+def test_the_index_has_a_link_to_every_page():
+    linked_pages = set()
+    for _, target in read_page(ROOT / "docs/README.md").links:
+        path, _, _ = target.partition("#")
+        linked_pages.add((ROOT / "docs" / path).resolve())
+    pages = set()
+    for folder in ("how-to", "spec", "decisions"):
+        pages |= set((ROOT / "docs" / folder).glob("*.md"))
+    assert pages - linked_pages == set()
 
 
 def test_fault_numbers_and_exit_statuses_are_documented():
@@ -36,23 +44,27 @@ def test_fault_numbers_and_exit_statuses_are_documented():
         explanation = EXPLANATIONS[fault]
         line = f"* **{int(fault)}**: {explanation.problem} ({explanation.cause}): {explanation.remedy}"
         assert line in " ".join(text.split())
-    kinds = {PolysightError, NoResult, *PolysightError.__subclasses__()}
-    # 130 is that of a program that Ctrl-C ended: 128 + the number of SIGINT.
-    expected_statuses = {kind.exit_status for kind in kinds} | {0, 130}
-    documented_statuses = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
+    kinds_of_error = {PolysightError, NoResult, *PolysightError.__subclasses__()}
+    success = 0
+    interrupted = 128 + signal.SIGINT
+    expected_statuses = {kind.exit_status for kind in kinds_of_error} | {success, interrupted}
+    table_of_statuses, _ = text.split("## Messages of a scan")
+    documented_statuses = {int(number) for number in re.findall(r"^\| (\d+) \|", table_of_statuses, re.MULTILINE)}
     assert documented_statuses == expected_statuses
 
 
 def test_every_request_to_a_scan_is_documented():
     page = (ROOT / "docs/how-to/live-view.md").read_text(encoding="utf-8")
-    assert all(f"control/{command}" in page for command in ScanCommand)
-    assert list(ScanCommand) == [*SCAN_COMMANDS]
+    for command in ScanCommand:
+        assert f"control/{command}" in page
+    assert list(SCAN_COMMANDS) == list(ScanCommand)
 
 
-def test_the_drawing_shows_the_rig_file_and_the_sketch():
+def test_the_drawing_of_the_wiring_has_the_pins_and_addresses_of_the_rig_file_and_the_stage_s_program():
     drawing = (ROOT / "docs/images/wiring.svg").read_text(encoding="utf-8")
     rig = tomllib.loads((ROOT / "instrument.toml").read_text(encoding="utf-8"))
-    pin = dict(re.findall(r"PIN_(\w+) = (\d+)", (ROOT / "arduino_stage/board.h").read_text(encoding="ascii")))
+    board_file = (ROOT / "arduino_stage/board.h").read_text(encoding="ascii")
+    pin = dict(re.findall(r"PIN_(\w+) = (\d+)", board_file))
     assert f"GPIO {rig['pi']['trigger_in']} (" in drawing
     assert f"GPIO {rig['pi']['sync_out'][0]} (" in drawing
     assert f"D{pin['TRIGGER']} trigger" in drawing
@@ -60,37 +72,39 @@ def test_the_drawing_shows_the_rig_file_and_the_sketch():
         assert f"D{pin[name + '_PUL']}/D{pin[name + '_DIR']}" in drawing
     assert f"D{pin['ENABLE']}  enable" in drawing
     for board in rig["boards"]:
+        _, _, last_byte_of_address = board["card_address"].rpartition(".")
         assert f">{board['name']}  " in drawing
-        assert "DCA1000EVM  ." + board["card_address"].rpartition(".")[2] in drawing
+        assert f"DCA1000EVM  .{last_byte_of_address}" in drawing
         assert board["host_address"] in drawing
 
 
-def test_what_the_installation_writes_is_what_the_programs_want():
+def test_the_installation_sets_the_addresses_rights_and_limits_that_the_programs_use():
     text = (ROOT / "docs/how-to/install.md").read_text(encoding="utf-8")
     rig = tomllib.loads((ROOT / "instrument.toml").read_text(encoding="utf-8"))
     rights = (ROOT / "host/rights.sh").read_text(encoding="utf-8")
     assert "host/rights.sh" in text
     assert f'ATTR{{idVendor}}=="{VENDOR:04x}", ATTR{{idProduct}}=="{PRODUCT:04x}"' in rights
     assert f"net.core.rmem_max = {rig['card']['receive_buffer_bytes']}" in rights
-    assert {board["host_address"] for board in rig["boards"]} == {re.findall(r"addresses ([\d.]+)/24", text)[0]}
+    host_address = re.search(r"addresses ([\d.]+)/24", text)[1]
+    assert {board["host_address"] for board in rig["boards"]} == {host_address}
     assert f"cd {rig['pi']['key_dir'].removesuffix('/keys')}\n" in (ROOT / "docs/how-to/bring-up.md").read_text()
     assert rig["pi"]["key_dir"] in text
 
 
-def test_the_label_file_that_is_shown_can_be_learnt_from(tmp_path):
-    (block,) = [b for b in read_page(ROOT / "docs/spec/labels.md").blocks if b.language == "json"]
+def test_the_example_of_a_label_file_is_valid(tmp_path):
+    (block,) = [block for block in read_page(ROOT / "docs/spec/labels.md").blocks if block.language == "json"]
     (tmp_path / "labels.json").write_text(block.text, encoding="utf-8")
     axis_m = np.linspace(-0.1, 0.1, 101)
     boxes = check_labels(read_labels(tmp_path / "labels.json"), axis_m, axis_m)
     assert [boxes.specimen(name) for name in boxes.boxes] == [None, "board 7", "2"]
-    assert (boxes.metal, boxes.by_hand) == ("copper", True)
+    assert boxes.metal == "copper"
+    assert boxes.by_hand is True
 
 
-def test_the_python_blocks_about_imaging_run(tmp_path, monkeypatch):
-    """They use packages that are not part of the public interface, whose names may change without notice."""
-    simulate(
-        load_published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "test"), tmp_path / "scans" / "points"
-    )
+def test_the_python_code_on_the_page_about_imaging_runs(tmp_path, monkeypatch):
+    """It uses packages that are not part of the public interface, so that their names may change without notice."""
+    scene = decode_scene(make_scene(COPPER, columns=4, rows=3), "test")
+    simulate(load_published_rig(), scene, tmp_path / "scans" / "points")
     monkeypatch.chdir(tmp_path)
     blocks = [block for block in read_page(ROOT / "docs/how-to/imaging.md").blocks if block.info == ("python", "run")]
     assert len(blocks) > 1

@@ -1,4 +1,7 @@
-"""Each of our programs starts as a real process, and the forked process of other tests behaves like it."""
+"""Each program starts as a process of its own, and behaves like the forked process that other tests use instead.
+
+Other tests fork programs from a process that has loaded their modules, which takes less time.
+"""
 
 import os
 import signal
@@ -24,7 +27,7 @@ PROGRAMS = [
         for name in ("cards", "radars", "rig", "stage", "uno", "wires")
     ),
 ]
-# Tests fork commands that begin with one of our programs. One that begins with `env` is really started.
+# Tests fork commands that begin with the name of a program. A command that begins with `env` is really started.
 REAL = ("env",)
 
 
@@ -32,11 +35,11 @@ REAL = ("env",)
 def test_a_forked_program_has_the_output_and_the_status_of_one_that_is_started(
     tmp_path: Path, command: tuple[str | Path, ...]
 ):
-    """Other tests fork programs from a process that has loaded them, which takes less time."""
     forked = subprocess.run(command, cwd=tmp_path, input="", capture_output=True, text=True, check=False)
     real = subprocess.run([*REAL, *command], cwd=tmp_path, input="", capture_output=True, text=True, check=False)
-    assert (forked.returncode, forked.stdout) == (real.returncode, real.stdout)
-    # Tracebacks differ, but for their last line: the fork's has more.
+    assert forked.returncode == real.returncode
+    assert forked.stdout == real.stdout
+    # A traceback of the forked program has more lines, but the last one is the same.
     assert forked.stderr.splitlines()[-1:] == real.stderr.splitlines()[-1:]
 
 
@@ -45,13 +48,13 @@ def test_a_forked_program_has_the_command_line_parent_session_and_end_of_a_start
     with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as program:
         assert program.stdout is not None
         assert program.stdout.readline().startswith(b"ready")
-        words = " ".join(map(str, command))
-        assert {pid: line.rstrip() for pid, line in list_processes_naming(str(tmp_path)).items()} == {
-            program.pid: words
-        }
+        command_line = " ".join(map(str, command))
+        processes = list_processes_naming(str(tmp_path))
+        assert list(processes) == [program.pid]
+        assert processes[program.pid].rstrip() == command_line
         assert os.getsid(program.pid) == os.getpgid(program.pid) == program.pid
         status = Path(f"/proc/{program.pid}/status").read_text()
         assert f"PPid:\t{os.getpid()}\n" in status
         os.killpg(program.pid, signal.SIGKILL)
     assert program.returncode == -signal.SIGKILL
-    wait_for(lambda: not list_processes_naming(str(tmp_path)), "that nothing of it is left")
+    wait_for(lambda: not list_processes_naming(str(tmp_path)), "the end of all its processes")

@@ -1,4 +1,7 @@
-"""No command loads a package that it does not use: numpy takes 0.2 s, matplotlib or scipy.stats a second."""
+"""Commands start without delay: none loads a package that it does not use.
+
+To load numpy takes 0.2 s, matplotlib or scipy.stats a second.
+"""
 
 import json
 import subprocess
@@ -26,6 +29,7 @@ HEAVY = {
     "scipy.spatial", "scipy.special", "scipy.stats",
 }  # fmt: skip
 
+# Runs a command; prints its exit status and the names of all loaded modules.
 RUN = """
 import contextlib, io, json, sys
 from polysight.cli.main import main
@@ -39,7 +43,7 @@ sys.stdout.write(json.dumps([status, sorted(sys.modules)]))
 
 
 def list_loaded_modules(*words: str | Path) -> set[str]:
-    """Modules that a new process has loaded after a command succeeded in it."""
+    """Run a command in a new process, and check that it succeeds; return the modules that it has loaded."""
     command = [sys.executable, "-c", RUN, *map(str, words)]
     process = subprocess.run(command, capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
     status, modules = json.loads(process.stdout)
@@ -47,19 +51,19 @@ def list_loaded_modules(*words: str | Path) -> set[str]:
     return set(modules)
 
 
-def test_help_and_version_need_no_numbers():
+def test_help_and_version_load_neither_numpy_nor_scipy():
     for words in (["--help"], ["--version"]):
         assert list_loaded_modules(*words) & (NUMBERS | SCIPY | HEAVY) == set(), words
 
 
 @pytest.mark.parametrize("command", [names[0] for names in FAMILIES.values()])
-def test_help_of_a_command_needs_no_numbers(command):
-    """One command of each family; a family is one module."""
+def test_help_of_a_command_loads_neither_numpy_nor_scipy(command):
+    """One command of each family is tested: the commands of a family are in one module."""
     assert list_loaded_modules(command, "--help") & (NUMBERS | SCIPY | HEAVY) == set()
 
 
 @pytest.mark.parametrize("command", ["materials", "report", "permittivity"])
-def test_saved_products_are_shown_without_mathematics(tmp_path, command):
+def test_saved_products_are_shown_without_scipy_and_figures(tmp_path, command):
     products = write_judged_products(tmp_path / "products", "good")
     (products / "report.html").write_text("<p>here</p>")
     assert list_loaded_modules(command, products) & HEAVY == set()
@@ -78,22 +82,16 @@ def test_images_are_made_without_report_and_figures(tmp_path):
     assert loaded & {"jinja2", "matplotlib", "polysight.report", "sklearn"} == set()
 
 
-def test_a_plan_is_made_without_scipys_parts():
+def test_a_plan_is_made_without_the_parts_of_scipy_that_take_long_to_load():
     assert list_loaded_modules("plan", "--config", RIG_FILE) & HEAVY == set()
 
 
 def test_modules_of_jobs_load_heavy_packages_only_when_they_compute():
-    jobs = {f.stem for f in (RIG_FILE.parent / "host" / "polysight" / "jobs").glob("[a-z]*.py")}
-    modules = [
-        *(f"jobs.{job}" for job in sorted(jobs)),
-        "pipeline",
-        "acquisition",
-        "doctor",
-        "api",
-        "planning",
-        "serve",
-    ]
-    code = "import sys\n" + "".join(f"import polysight.{m}\n" for m in modules) + "print(*sys.modules)"
+    files_of_jobs = sorted((RIG_FILE.parent / "host" / "polysight" / "jobs").glob("[a-z]*.py"))
+    modules = [f"jobs.{file.stem}" for file in files_of_jobs]
+    modules += ["pipeline", "acquisition", "doctor", "api", "planning", "serve"]
+    imports = "".join(f"import polysight.{module}\n" for module in modules)
+    code = f"import sys\n{imports}print(*sys.modules)"
     process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=RIG_FILE.parent
     )
@@ -101,8 +99,9 @@ def test_modules_of_jobs_load_heavy_packages_only_when_they_compute():
 
 
 @pytest.mark.parametrize("window", ["hann", *TAPERS.values()])
-def test_windows_without_scipy_are_those_of_scipy(window):
-    for n in (1, 2, 7, 64):
-        # Ours have no zeros at their ends.
-        expected = scipy.signal.get_window(window, n + 2, fftbins=False)[1:-1]
-        assert_allclose(make_window(window, n), expected, rtol=0, atol=1e-15)
+def test_windows_that_are_computed_without_scipy_are_those_of_scipy(window):
+    for length in (1, 2, 7, 64):
+        # They have no zeros at their ends, as those of scipy do.
+        longer_window = scipy.signal.get_window(window, length + 2, fftbins=False)
+        # A few rounding errors.
+        assert_allclose(make_window(window, length), longer_window[1:-1], rtol=0, atol=1e-15)

@@ -1,8 +1,8 @@
-"""Changes of the gain of V over H during a scan, from the slopes of ln(V / H) over the plates.
+"""Estimate how the gain of V over H changes during a scan, from the slopes of ln(V / H) over the plates.
 
-V and H are the complex images of both receivers, so ln(V / H) has the ratio of amplitudes as its real part and the
-phase difference (radians) as its imaginary part. The stage moves the whole rig. So ln(V / H) would be constant over a
-plate, and its slopes (per metre) along x and y would be 0, but for four causes:
+V and H are the complex images of both receivers, so ln(V / H) has the logarithm of the ratio of amplitudes as its real
+part and the phase difference (radians) as its imaginary part. The stage moves the whole rig. So ln(V / H) would be
+constant over a plate, and its slopes (per metre) along x and y would be 0, but for four causes:
 
 - The gains drift. The gain is then a function of y, because rows are scanned one after the other.
 - A second path beside the direct path makes fringes over the plane of the stage, in any direction. They are as large in
@@ -10,9 +10,16 @@ plate, and its slopes (per metre) along x and y would be 0, but for four causes:
 - Images of H and V are not in the same place: that gives all plates the same slope.
 - A plate has slopes of its own: it is uneven or disturbed, or a copy of another plate lies on it.
 
-Drift and fringes together are one field g(x, y), of which the plates' slopes are the measured derivatives (Gaussian
-process; Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 9.4). The uncertainty of g that these
-slopes leave becomes part of the error of each plate.
+Each part of ln(V / H) is treated separately. Drift and fringes are one smooth field g(x, y) of mean zero. The measured
+slopes of a plate at p are
+
+    s_j = 0.88 dg/dx_j(p) + slope common to all plates + the plate's own slope + noise        j = x, y
+
+With s the slopes of all plates, S their covariance and C that of g(p) - g(origin) with s, g is expected to change by
+C S^-1 s from the origin, the metal reference, to the plate (Gaussian process; Rasmussen and Williams, Gaussian
+Processes for Machine Learning, 2006, 9.4). What is left of its variance becomes part of the error of the plate.
+The standard deviations of all terms are unknown: each combination of their possible values is a *case*, and results are
+averaged over the cases, weighted by their prior probability and the probability density of s.
 """
 
 from __future__ import annotations
@@ -44,10 +51,10 @@ DRIFT_LENGTHS_M = (0.05, 0.07, 0.15)
 """Correlation lengths of the drift along y, the slow axis of the scan: half a wave of it is 0.13 to 0.4 m long. All
 are equally probable."""
 SEEN_SLOPE_SHARE = 0.88
-"""Slope of ln(V / H) within a plate's image over the slope of the gain. A pixel has the gain averaged over a Fresnel
-zone. Near a plate's edge only the plate's side of that zone echoes, so the average is nearer the gain in the middle of
-the plate. In 100 drifting scenes of the independent generator the gain changed between plates by 1.1 to 1.2 times the
-integral of the slopes."""
+"""Slope of ln(V / H) within a plate's image divided by the slope of the gain. A pixel has the gain averaged over a
+Fresnel zone. Near a plate's edge only the plate's side of that zone echoes, so the average is nearer the gain in the
+middle of the plate. In 100 drifting scenes of the independent generator the gain changed between plates by 1.1 to 1.2
+times the integral of the slopes (1 / 0.88 = 1.14)."""
 FRINGE_PRIOR = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
 """Standard deviation of the fringes in either part of ln(V / H), to its prior probability; 0: no fringes. The published
 rig shows 10 to 20 %."""
@@ -66,27 +73,28 @@ ALIKE_BOTH_WAYS = 0.7
 have slopes along y alone, the direction in which H and V see different places."""
 LIKELY_FRINGES = 0.5
 WEAK_LEVEL = 0.2
-"""Probability of fringes from which they have to be likely without the plates of weaker |V / H| relative to metal; the
-level is chosen. Light from bright edges, or from a table behind, is as strong as V of such plates."""
+"""If the probability of fringes is above the first, it is computed again without plates whose |V / H| relative to metal
+is below the second (chosen), and the smaller one counts. Light from bright edges, or from a table behind, is as strong
+as V of such plates."""
 BORDER_SLOPE_STD = 100.0
 """Standard deviation of the slope of a plate at the border of the image, per metre: so large that it is not used."""
 LEAST_ROW_PIXELS = 4
 LEAST_PLATE_ROWS = 5
-"""Pixels that a row of a plate's interior has to have, and rows that a plate has to have, so that the phase along it is
-measured; chosen."""
+"""The phase along a plate is measured in rows of its interior with at least as many pixels, if there are at least as
+many rows; chosen."""
 RIM_ROWS = 3
-"""Rows at either end of a plate's interior that are not used for it: a drift of the phase moves the image of V against
-that of H, and the edges of plates reach farther in; chosen."""
+"""Rows at either end of a plate's interior in which this phase is not measured: a drift of the phase moves the image of
+V against that of H, and the effect of the plate's edges reaches farther in; chosen."""
 LEAST_SLOPE_STD = 1e-3
 """Smallest standard deviation of a measured slope, per metre."""
 RIPPLE_M = 0.015
-"""Error of a plate's ln(V / H) over the root mean square of its own slopes: a copy of another plate turns its phase
-against the plate by 50 to 100 radians per metre. 15 mm fits the errors of plates of the independent generator best (20
-and 30 mm are worse)."""
+"""Error of a plate's ln(V / H) divided by the root mean square of its own slopes: the phase of a copy of another plate
+changes against the plate's by 50 to 100 radians per metre. 15 mm fits the errors of plates of the independent generator
+best (20 and 30 mm are worse)."""
 SHARE_OF_CHANGE = 0.85
-"""Factor of the estimated errors by drift and fringes. Of 4,800 plates of the independent generator errors are 0.5 to
-0.65 of the estimate where there may be a drift, and 0.75 to 1.15 where there is one. With less, drifts drawn at random
-were too often beyond their errors."""
+"""Factor of the estimated errors by drift and fringes. For 4,800 plates of the independent generator the errors are 0.5
+to 0.65 of the estimate where there may be a drift, and 0.75 to 1.15 where there is one. With a smaller factor, drifts
+drawn at random exceeded their errors too often."""
 PHASE_OF_CHANGE = 0.75
 """Factor of the estimated error of a plate's phase by drift, fringes and its own slopes. The slopes of the phase are
 larger than those of the amplitude, but its errors are not. Where these errors dominate, the factor at which 68 % lie
@@ -109,8 +117,8 @@ class CommonChange:
     Attributes
     ----------
     value, std
-        complex [plate]: change by drift and fringes; its errors, that of the real part as the real part of `std`, that
-        of the imaginary part as its imaginary part: 1.96 of them hold 95 % or more (`_ExpectedFromSlopes.error`).
+        complex [plate]: change by drift and fringes, and the errors of its real part (real part of `std`) and of its
+        imaginary part (imaginary part of `std`): 1.96 of them hold 95 % or more (`_ExpectedFromSlopes.error`).
     drift, drift_std
         complex [plate]: the same by drift alone; `drift_std` are standard deviations.
     ripple
@@ -266,7 +274,10 @@ class _Field:
         distance_from_origin = (places_m - origin_m) * np.array(axes)
         covariance = np.exp(-0.5 * np.sum(distance**2, axis=-1) / length_m**2)
         covariance_with_origin = np.exp(-0.5 * np.sum(distance_from_origin**2, axis=-1) / length_m**2)
-        # Derivatives of the Gaussian covariance with respect to both places, and to one place.
+        # With r = p - q, cov(g(p), g(q)) = k(r) = exp(-|r|^2 / (2 L^2)), its derivatives are
+        #   cov(dg/dx_i(p), dg/dx_j(q)) = k(r) (delta_ij - r_i r_j / L^2) / L^2     [p, q, i, j]
+        #   cov(g(p), dg/dx_j(q)) = k(r) r_j / L^2                                  [p, q, j]
+        # and the latter with p = origin, r = origin - q, is subtracted.
         product = distance[..., :, None] * distance[..., None, :] / length_m**2
         slope_covariance = covariance[..., None, None] * (np.diag(axes) - product) / length_m**2
         covariance_with_slopes = (
@@ -365,8 +376,8 @@ class _Fields:
         for first in range(0, len(drifts), drifts_at_once):
             fields_of_drift = drifts[first : first + drifts_at_once]
             explained = common_covariance + np.stack([drift**2 * field.of_slopes for field, drift in fields_of_drift])
-            # Gaussian process: the expected value of any quantity is its covariance with the slopes times `answer`,
-            # [drift, own, 2 plate].
+            # S^-1 [drift, own, 2 plate, 2 plate], and `answer` = S^-1 s [drift, own, 2 plate]: the expected value of
+            # any quantity is its covariance with the slopes times `answer`.
             inverse = np.asarray(np.linalg.inv(explained[:, None] + own_variances), np.float64)
             answer = inverse @ measured
             drift_covariance = np.stack([drift**2 * field.with_slopes for field, drift in fields_of_drift])

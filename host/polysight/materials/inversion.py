@@ -5,21 +5,23 @@ Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measur
     V / H = (1 + rho) exp(j c + G.w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
 * a, b: leakage of p into H and of s into V; rho: relative error of the metal reference, complex.
-* c: phase by the metal's paint, radians; 0 of bare metal.
-* w: rise of the plate minus the metal's, along the plane of incidence and across it, radians; G: slope of ln(V / H).
+* c: phase by paint on the metal, radians; 0 of bare metal.
+* w: rise (slope angle) of the plate minus the metal's, [along the plane of incidence, across it], radians.
+* G: derivative of ln(V / H) with respect to w; H's board and V's see a plate from different points.
 * r_s, r_p: reflection coefficients, which follow from t and the angle of incidence by Eq. 2, 3 (POLySIGHT paper).
 * kappa: brightness of the patch relative to an ideal one (thickness, roughness, illumination).
 
 A plate that rises by w across the plane of incidence turns the s axis of both waves by d = w sin(theta). To first order
-H receives (1 - d) r_s - d r_p, and V (1 + d) r_p + d r_s. So its a is smaller by d, its b larger by d. G across is
-4 sin(theta): 2 by these amplitudes, 2 as the metal's (1 + a) / (1 + b) stays; plus that of boards at different places.
+H receives (1 - d) r_s - d r_p, and V (1 + d) r_p + d r_s. So the patch has a - d and b + d instead of a and b, and
+V / H a factor 1 + 2 d. (1 + a) / (1 + b) is of the metal and does not change, but is computed from the patch's a and b,
+smaller by 2 d. G across has 4 sin(theta) for both.
 
 The *common errors* of a scene are a, b, rho, c, G, the turn d / w, the error of the angle, the metal's brightness, the
 usual size of ln kappa, whether the mount has moved, and the share of the library's materials. Their posterior is
-sampled (sequential Monte Carlo with tempering; Del Moral, Doucet and Jasra, J. R. Stat. Soc. B 68, 2006). Its evidence
-is that each patch's t has to be of some material (`Kinds`), and that each |H| fits its t up to kappa.
+sampled (sequential Monte Carlo with tempering; Del Moral, Doucet and Jasra, J. R. Stat. Soc. B 68, 2006), given that
+each patch's t is of some material (`Kinds`), and that each |H| fits its t up to kappa.
 The permittivity and the name of a patch come from the common errors' posterior without the evidence of that patch's own
-material. So its permittivity is measured, not drawn to the nearest material, and its name is the kind that fits it.
+material. So the permittivity is measured, not moved to the nearest material, and the name is the kind that fits it.
 """
 
 from __future__ import annotations
@@ -61,30 +63,30 @@ differ by 3 %; thin, tilted, unevenly lit ones by a factor of two (published pic
 METAL_BRIGHTNESS_STD = 0.5
 """Prior standard deviation of the metal's own ln kappa; chosen."""
 LIBRARY_SHARE = (0.05, 0.85)
-"""Prior range of the share of a scene's patches that are of the library's materials; uniform. Up to 0.95 it expected
-55 % where 50 % were (308 scenes of the independent generator), and names were surer than right."""
+"""Prior range of the share of a scene's patches that are of the library's materials; uniform. With 0.05 to 0.95 the
+estimate was 55 % where 50 % are true (308 scenes of the independent generator): names had too high probabilities."""
 WEIGHT_OF_KINDS = 0.8
 """Weight of the patches' materials as evidence if the leakage was never measured (coarsened posterior; Miller and
-Dunson, 2019). Plates are alike, and taken as independent. With 1, eps'' of 33 scenes were 0.9 standard errors low."""
+Dunson, 2019): plates are alike, but count as independent. With 1, eps'' of 33 scenes were 0.9 standard errors low."""
 MOVED_PROBABILITY = 0.5
 MOVED_STD = 0.025
 """Probability that the mount has moved since its leakage was measured, and the standard deviation of the leakage then
-(1 to 3 degrees, chosen). With a probability of 0.1 only 85 % of the 95 % regions held where V's board had turned."""
+(1 to 3 degrees, chosen). With a probability of 0.1, and V's board turned, the 95 % regions held the truth in 85 %."""
 TURN_PER_RISE = -0.82
 TURN_STD = 0.1
-"""Change of a per radian of rise across the plane of incidence, and its standard deviation: -sin(theta) of the
-published rig; 0.1 for antennas whose polarisation turns off axis. A TX turned to the other side has the other sign."""
+"""Change of a per radian of rise across the plane of incidence, -d / w = -sin(theta) of the published rig (with a TX
+turned to the other side: sin(theta)), and its standard deviation, for antennas that turn polarisation off axis."""
 UNEVEN_LIGHT = (1.0, 1.0)
 EVEN_LIGHT = (0.3, 0.5)
-"""Standard deviations of G, per radian, along the plane of incidence and across it, as H's board and V's see a plate
-from different points; without and with the correction of illumination. The independent generator has 0.6 along."""
+"""Standard deviations of G, per radian, along the plane of incidence and across it, without and with the correction of
+illumination. The independent generator has 0.6 along."""
 PAINTED_PROBABILITY = 0.02
 POSSIBLY_PAINTED = 0.2
 """Prior probability that the metal is painted or coated; and posterior probability above which paint is an error of
 pixels and sub-bands, too. Both chosen: a lower second one would widen the errors of what is rather bare metal."""
 LEAST_PAINTED = 0.05
-"""Probability of paint, and of bare metal, from which it stays as probable for each patch as for the scene, and names
-weigh both cases apart; chosen."""
+"""If paint and bare metal both have at least this probability, each patch is estimated with the scene's probability of
+paint, and named from both cases separately; chosen."""
 MOST_PAINT_RAD = 0.65
 PAINT_RAD_PER_MM = 2.65
 """Largest phase c by paint on metal, and c per thickness: 4 pi / lambda sin^2(theta) / cos(theta) (1 - 1 / eps) of a
@@ -95,9 +97,9 @@ CHI2_997 = 11.8
 """Squared distances, in standard deviations, within which 95 and 99.7 % of a 2-D normal distribution lie."""
 OWN_FREEDOM = 3.0
 OWN_SCALE = float(np.sqrt(CHI2_95 / (OWN_FREEDOM * (0.05 ** (-2 / OWN_FREEDOM) - 1))))
-"""Degrees of freedom of a patch's own errors (2-D Student's t), whose size is estimated from a few places of the plate;
-and the scale at which the 95 % region is as large as that of the normal distribution. Where own errors dominate, 95 %
-lie within 2.1 to 3.6 times the interval that holds 68 % (drawn scenes; normal: 1.96)."""
+"""Degrees of freedom of a patch's own errors (2-D Student's t): their size is estimated from a few places of the plate.
+And the scale at which the 95 % region is as large as that of the normal distribution. Where own errors dominate, the
+interval that holds 95 % is 2.1 to 3.6 times as wide as that of 68 % (drawn scenes; normal distribution: 1.96)."""
 LEAST_DISTANCE = 4.0
 """Least distance of t, or of 1 / t, from 1 (metal) for a permittivity, in standard deviations of t; chosen."""
 SOURCES = ("scatter", "metal reference", "leakage", "incidence", "tilt")
@@ -366,8 +368,8 @@ class SceneLikelihood:
     def move_into(self, prior: RigPrior, z: Real) -> Real:
         """Convert particles of this hypothesis to particles of `prior`, in which it is one of several cases."""
         out = z.copy()
-        out[:, HAS_MOVED] = _place(z[:, HAS_MOVED], self.prior.moved, prior.moved)
-        out[:, PAINT] = _place(z[:, PAINT], self.prior.painted, prior.painted)
+        out[:, HAS_MOVED] = _convert_to_prior(z[:, HAS_MOVED], self.prior.moved, prior.moved)
+        out[:, PAINT] = _convert_to_prior(z[:, PAINT], self.prior.painted, prior.painted)
         return out
 
     def _estimate_paint_probability(self) -> float:
@@ -489,10 +491,10 @@ def _list_cases(probability: float) -> list[tuple[float, float]]:
     return [(value, share) for value, share in ((0.0, 1 - probability), (1.0, probability)) if share > 0]
 
 
-def _place(z: Real, certainty: float, probability: float) -> Real:
+def _convert_to_prior(z: Real, certainty: float, probability: float) -> Real:
     """Convert a column z of a hypothesis (`certainty` 1: it is so, 0: not) to one of a prior with this `probability`.
 
-    In the prior's column, a standard normal number, it is so in the uppermost part, which has that probability.
+    Columns are standard normal. In the prior's, it is so for the largest numbers, whose share is `probability`.
     """
     if certainty == probability:
         return z
@@ -511,8 +513,8 @@ def _anneal_without_patch(
 ) -> Real:
     """Move particles as `_anneal` to the posterior without a patch's evidence; paint stays as probable as before.
 
-    Paint is a fact of the scene, which all patches tell together. Without the patch that tells it best the metal would
-    be called bare, and the error bar of that patch would leave out the paint.
+    Paint is a fact of the scene, which all patches show together. Without the patch that shows it best the metal would
+    count as bare, and the error bar of that patch would not include the paint.
     """
     painted = model.paint(z)[:, 0] > 0
     if painted.mean() < LEAST_PAINTED:
@@ -537,6 +539,7 @@ def _anneal(
     """
     parts = model.log_likelihoods(z) if parts is None else parts
     change = after - before
+    # As the temperature goes from 0 to 1, the weights go from `before` to `after`, and log likelihoods rise by `gain`.
     temperature = 0.0
     log_evidence = 0.0
     while temperature < 1:
@@ -632,22 +635,20 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
     noise = rng.multivariate_normal(np.zeros(2), model.own[i], (DRAWS, len(z)), method="cholesky")
     drawn_t = t + noise[..., 0] + 1j * noise[..., 1]
     drawn_values = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
-    # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
-    difference = split_complex(drawn_t - middle)
-    distance2_of_region = (
-        np.einsum("...i,ij,...j->...", difference, np.linalg.inv(ratio_covariance), difference) < CHI2_997
-    )
-    parts = split_complex(drawn_values[distance2_of_region] - value)
-    covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
-    # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
-    distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
+    # Near metal the moments of the far tail do not exist: draws within 99.7 % of the ratio's distribution are kept.
+    deviation = split_complex(drawn_t - middle)
+    distance2 = np.einsum("...i,ij,...j->...", deviation, np.linalg.inv(ratio_covariance), deviation)
+    deviation = split_complex(drawn_values[distance2 < CHI2_997] - value)
+    covariance = np.asarray(deviation.T @ deviation / len(deviation), np.float64)
+    # Its 95 % ellipse is to hold 95 % of the draws; with a tail (the mount may have moved) it would hold more.
+    distance2 = np.einsum("...i,ij,...j->...", deviation, np.linalg.inv(covariance), deviation)
     covariance *= float(np.quantile(distance2, 0.95)) / CHI2_95
     shares = _shares_of_sources(model, z, i, value)
     # Student's t: the variance of normal errors is drawn, too; not from `rng`, so that other patches keep their draws.
     scale = OWN_SCALE * np.sqrt(OWN_FREEDOM / np.random.default_rng(i).chisquare(OWN_FREEDOM, noise.shape[:2]))
     drawn_t = t + scale * (noise[..., 0] + 1j * noise[..., 1])
-    difference = split_complex(permittivity_from_ratio(drawn_t, angles) - value)
-    real_68, imag_68 = np.nanquantile(np.abs(difference), 0.6827, axis=(0, 1)).tolist()
+    deviation = split_complex(permittivity_from_ratio(drawn_t, angles) - value)
+    real_68, imag_68 = np.nanquantile(np.abs(deviation), 0.6827, axis=(0, 1)).tolist()
     return PatchEstimate(
         inverse_ratio=middle, inverse_ratio_covariance=ratio_covariance, permittivity=value, covariance=covariance,
         shares=shares, evidence=evidence, half_widths_68=(real_68, imag_68),

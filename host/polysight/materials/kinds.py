@@ -1,10 +1,10 @@
 """Kinds of materials that a plate may be of, as densities over t = 1 / P: a library's, the literature's, and others.
 
-P = H / V is relative to metal; eps = eps' - j eps''. `of no kind` means: of no listed material. A kind is metal, or a
-half space whose ln eps' and eps'' are normal, as specimens differ; to first order its t is normal, too. A patch is of a
-kind of the library or of the literature, or any other half space, thin plate or stack. The density of t under all of
-them is the prior of the joint inversion; its parts give the probabilities of names. Eq. 2 and 3 of the POLySIGHT paper
-convert eps to P and back.
+P = H / V is the ratio relative to metal, eps = eps' - j eps'' the permittivity. A *kind* is a listed material: metal,
+or a half space whose ln eps' and eps'' are normally distributed over specimens; to first order its t is normal, too. A
+patch is of a kind of the library, of a kind of the literature, or *of no kind*: any other half space, a thin plate, or
+a stack of layers. The density of t under all of them is the prior of the joint inversion (`inversion.py`), its parts
+give the probabilities of names (`names.py`). Eq. 2 and 3 of the POLySIGHT paper convert eps to P and back.
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ USUAL_LIBRARY_SHARE = 0.5
 """Expected share of a library's materials in a scan that was processed without it; chosen."""
 LITERATURE_SHARE = 0.4
 """Share of the literature's kinds in thick plates that are of no kind of the library. The others are metal or any half
-space. The shares of this, of metal and of thin plates are chosen: with a larger one, uncertain patches get such
-names."""
+space. Chosen: with a larger share, uncertain patches are named as materials of the literature."""
 METAL_SHARE = 0.1
 """Share of metal in these thick plates; chosen."""
 SHEET_SHARE = 0.27
@@ -59,11 +58,11 @@ SHEET_KERNEL = 0.02
 """Standard deviation by which the distribution of the drawn plates' t is smoothed; chosen."""
 STACK_SHARE = 0.05
 """Share of stacks, neither half space nor thin plate, in patches of no kind of the library: a liquid behind glass may
-reflect as no passive half space does. Their density over t is 1 / pi, as on the unit disk. Without them three cups of
-sugar water moved the estimated leakage by three standard deviations, and their own t by a fifth."""
+reflect as no passive half space does. Their t is uniform on the unit disk, with the density 1 / pi. Without stacks,
+three cups of sugar water moved the estimated leakage by three standard deviations, and their own t by a fifth."""
 ODD_BRIGHTNESS = 0.1
 ODD_BRIGHTNESS_STD = 1.2
-"""Share of patches whose |H| fits no half space (shadows, edges), and the standard deviation of ln |H| then; chosen."""
+"""Share of patches whose |H| fits no half space (shadows, edges), and their standard deviation of ln |H|; chosen."""
 # Cells of a map of densities along each side of its rectangle; chosen.
 _MAP_CELLS = 96
 DISPERSION_KERNEL = 0.05
@@ -72,7 +71,8 @@ DISPERSION_MODEL = 0.2
 the change, for edges and for second echoes from the neighbourhood. Chosen."""
 ODD_DISPERSION = 0.02
 ODD_DISPERSION_STD = 0.05
-"""Share of half spaces whose surroundings change over the sweep, and the standard deviation of that change; chosen."""
+"""Share of half spaces whose echo changes over the sweep by their surroundings, and the standard deviation of that
+change; chosen."""
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens, in addition to that in proportion to eps''; chosen."""
 METAL_SPREAD = 0.01
@@ -81,7 +81,7 @@ SAME_MATERIAL = 0.005
 """Probability that two plates of a scene are of one material, before they are measured. Chosen: more leaves too few
 plates to determine the published picture's leakage (its half widths exceed 20 % from 0.02 on)."""
 DENSITY_OF_OTHERS = 20.0
-"""Density over t of a plate of another material: that of half spaces is 5 to 50 where most solids are."""
+"""Density over t of a plate of another material; that of half spaces is 5 to 50 where most solids are."""
 SPECIMEN_STD = 0.01
 """Relative standard deviation of V / H between plates of one material, cut from the same sheet; chosen."""
 LEAST_STD_OF_T = 1e-6
@@ -272,15 +272,16 @@ def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Comp
 
 
 def compute_probability_of_same_material(measurements: Sequence[PatchMeasurement]) -> Real:
-    """Return how likely each two plates of a scene are of one material, float64 [patch, patch]; 1 on the diagonal.
+    """Return the probability that two plates of a scene are of one material, float64 [patch, patch]; 1 on the diagonal.
 
-    If they are, their V / H differ by errors and specimens alone; if not, by anything. All plates share leakage and
-    reference, which hardly change the difference.
+    The V / H of two plates of one material differ by errors and specimens alone. The errors of leakage and reference,
+    which all plates share, hardly change the difference.
     """
     inverse_ratios = np.array([m.inverse_ratio for m in measurements], np.complex128)
     error_covariance = np.array([m.covariance for m in measurements], np.float64).reshape(-1, 2, 2)
     specimen_covariance = np.square(SPECIMEN_STD * np.abs(inverse_ratios))[:, None, None] * np.eye(2)
     covariance = error_covariance + specimen_covariance
+    # Normal density of the difference of each pair: [patch, patch, 2, 2] and [patch, patch, 2].
     inverse = np.linalg.inv(covariance[:, None] + covariance)
     difference = split_complex(inverse_ratios[:, None] - inverse_ratios)
     distance2 = np.einsum("...i,...ij,...j->...", difference, inverse, difference)
@@ -323,7 +324,11 @@ class HalfSpaces:
 
 
 def compute_brightness_density(difference: Real | float, std: Real | float) -> Real:
-    """Return a multiple of the density of ln |H| minus the expected value: usual (`std`) or odd (`ODD_BRIGHTNESS`)."""
+    """Return a multiple of the density of the `difference` of ln |H| from its expected value.
+
+    The density is a sum of two normal ones: that of usual patches with `std`, and that of patches whose |H| fits no
+    half space (`ODD_BRIGHTNESS`).
+    """
     usual_density = (1 - ODD_BRIGHTNESS) / std * np.exp(-0.5 * (difference / std) ** 2)
     odd_density = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (difference / ODD_BRIGHTNESS_STD) ** 2)
     return np.asarray(usual_density + odd_density, np.float64)
@@ -358,6 +363,7 @@ def split_complex(value: npt.ArrayLike) -> Real:
 def turn_covariance(factor: npt.ArrayLike, covariance: npt.ArrayLike) -> Real:
     """Return the covariance [..., 2, 2] of a complex number with `covariance`, times a complex `factor` [...]."""
     factor = np.asarray(factor, np.complex128)
+    # The matrix [[a, -b], [b, a]] multiplies (real, imaginary) parts by a + j b.
     matrix = np.stack([split_complex(factor), split_complex(1j * factor)], axis=-1)
     return np.asarray(matrix @ np.asarray(covariance, np.float64) @ matrix.swapaxes(-1, -2), np.float64)
 
@@ -456,8 +462,8 @@ class Kinds:
         border_t[is_outside] = inverse_ratio(real[is_outside] - 1j * loss[is_outside], self.theta_rad)
         # The slope is taken at the border instead of t: near t = 1, which is metal, it has no bound.
         slope = np.abs(find_permittivity_slope(border_t, self.theta_rad))
-        # The density over both coordinates, times their derivatives by eps' and eps'', times that of eps by t, squared
-        # for an area. An error of eps'' widens the linear part of its coordinate.
+        # density over t = density over coordinates (x, y) * dx/deps' * dy/deps'' * |deps/dt|^2, with 1 / eps' and
+        # 1 / hypot(eps'', SOFT_LOSS) for x and y. An error of eps'' widens the linear part of y.
         floor = np.hypot(SOFT_LOSS, slope * std)
         density = slope**2 * _interpolate_coordinate_density(real, loss) / (real * np.hypot(loss, floor))
         distance_beyond = np.abs(t - border_t) / max(std, LEAST_STD_OF_T)

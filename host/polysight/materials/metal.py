@@ -44,11 +44,12 @@ DOUBTFUL_V_DB = -2.5
 WEAK_V_DB = -7.0
 """V / H relative to the direct path. Below the first value an undeclared patch is not metal; below the second
 even a declared one is not. At 55 degrees half spaces of eps' up to 8 have -8 dB or less, of 10 -7 dB, bare water has
--4 dB, and metal 0 dB. The patterns of the antennas are added: -4 dB with those of an independent generator."""
+-4 dB, and metal 0 dB. The ratio of the antennas' patterns adds to this: -4 dB with those of an independent generator.
+"""
 LEAST_SCORE = 1.7
 SURE_MARGIN = 1.5
-"""Score from which an undeclared patch counts as metal beside one other patch, and how much more makes it
-certain. The first is multiplied by the square root of the number of other patches, for each may be an odd one. With the
+"""Least score with which an undeclared patch counts as metal if there is one other patch, and how much more makes it
+certain. The first is multiplied by the square root of the number of other patches, as each may be an odd one. With the
 direct path, the reference counts as metal in none of 125 drawn scenes without metal (open water comes closest, and is
 doubtful by its V / H), and in all of 75 with metal (tests/materials/test_metal_evidence.py)."""
 REFERENCE_REAL = (1.5, 30.0)
@@ -60,8 +61,8 @@ CHANNEL_RATIO_STD_DB = 2.5
 chosen."""
 CONFLICT_SCORE = 0.0
 """Score below which a declared metal is reported as doubtful, with the patch that fits it least: below 0 the other
-patches fit better to a dielectric. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this
-estimator; dielectrics declared as metal have -0.3 to -8 in eleven."""
+patches fit a dielectric better. Metal has 1.3 or more in 52 scenes of an independent generator; dielectrics declared as
+metal have -0.3 to -8 in eleven."""
 CONTRADICTING_SCORE = -5.0
 """Score below which a declared metal is contradicted if its own V / H is below `DOUBTFUL_V_DB`, too. Chosen: eight half
 spaces and a wafer declared as metal have scores of -7 to -27 and V / H of -3 to -8 dB; metal has scores of 7 to 31 and
@@ -71,10 +72,10 @@ PAINT_SCORE = 7.0
 ALIKE_DB = 2.5
 LEAST_METAL_LEVEL = 0.15
 MOST_METALS = 3
-"""Another patch may be the metal instead of the brightest one if its |V / H| is at most so many dB below that of the
-brightest patch, and its |H||V| at least this share. So many patches are compared, the brightest included. Coated metal
-(sheets, boards with copper behind) may be the brighter one: all disturbances together have made bare metal darker than
-a coated one by a factor of four. Dielectrics reflect p by 8 dB less."""
+"""Another patch may be the metal instead of the brightest one if its |V / H| is at most `ALIKE_DB` below that of the
+brightest patch, and its |H||V| at least `LEAST_METAL_LEVEL` of that patch's. `MOST_METALS` patches are compared, the
+brightest included. Coated metal (sheets, boards with copper behind) may be the brightest: all disturbances together
+have made bare metal darker than coated metal by a factor of four. Dielectrics reflect p by 8 dB less than metal."""
 HALO_MM = (6.0, 36.0)
 """Smallest and largest distance from the metal's edge at which its halo is measured; chosen."""
 AROUND_MM = (4.0, 14.0)

@@ -1,7 +1,12 @@
-"""Names of patches and of their pixels, from the ratio t = V / H, relative to metal, that one scan or several measured.
+"""Name patches and their pixels by the ratio t = V / H, relative to metal, that one scan or several measured.
 
 A *kind* is a material that a patch may be of: of the user's library, or of the literature. `Kinds` holds them for one
-incidence angle, `Odds` their probabilities for one patch.
+incidence angle, `Odds` their probabilities for one patch. They are proportional to
+
+    share of the kind x normal density of the measured t about the kind's t
+
+with the covariance of the measurement plus that of specimens of the kind. Thin plates, stacks of layers, and half
+spaces that are no kind compete with their own shares and densities.
 
 A name is a material of the library, materials of the literature together ("like PTFE or paraffin wax (literature)"), a
 possible layer, or unknown. The probabilities of a patch's names sum to one.
@@ -38,9 +43,9 @@ Complex = npt.NDArray[np.complex128]
 
 UNKNOWN = "unknown"
 LOOK_ALIKE_ODDS = 1.8
-"""Odds that a patch is of no kind of the library over those by the share and the densities of kinds (`Kinds`):
-materials are more alike than a smooth density says. Chosen: in 616 scenes of an independent generator, half of whose
-plates no library has, 82 % of the names said at 0.8 to 0.95 were right without it, and 87 % with it."""
+"""Factor by which the odds that a patch is of no kind of the library are raised: materials are more alike than the
+smooth densities of `Kinds`. Chosen: in 616 scenes of an independent generator, half of whose plates no library has,
+82 % of the names with a probability of 0.8 to 0.95 were right without it, and 87 % with it."""
 INCLUSION_SHARE = 0.05
 """Share of a patch's pixels that may be of any material of the library (chosen); the prior of the others is the patch's
 probabilities."""
@@ -49,8 +54,8 @@ UNKNOWN_BUDGET = 0.03
 LEAST_PROBABILITY = 0.005
 """Materials of less probability are not listed; chosen."""
 LIKELY_UNKNOWN = 0.05
-"""A material that the library lacks is not reported as a rival with less probability: a few percent are always left for
-it; chosen."""
+"""With less probability, "a material that the library lacks" is not listed among the other possible names: it always
+has a few percent. Chosen."""
 LAYER = "possible layer"
 """Name of a patch that is rather a thin plate or a stack of layers than a half space."""
 POSSIBLY_THIN = 0.2
@@ -60,8 +65,8 @@ published picture's plates only thin wood has."""
 MOST_NAMES = 3
 """Largest number of names in "like ... (literature)"; chosen."""
 MOST_OF_IT = 0.8
-"""Least share of the literature's probability that these names hold together, and of a family's that one material must
-hold to be named instead of it; chosen."""
+"""Least share of the literature's probability that the names in "like ... (literature)" hold together, and of a
+family's probability that one material must hold to be named instead of the family; chosen."""
 # Number of half spaces that are drawn to join scans at several angles; chosen.
 _HALF_SPACES = 4000
 
@@ -166,9 +171,13 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
 def _weigh_kinds_of_case(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Odds:
     """Return the probabilities of `weigh_kinds` from evidence of one case each."""
     first = kinds[0]
+    # Real and imaginary parts of t of all scans make a vector of this size.
     size = 2 * len(scan_evidence)
     errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in scan_evidence))
     t = np.array([evidence.inverse_ratio for evidence in scan_evidence])
+
+    # Normal density of t about each kind's: covariance [kind, size, size] of specimens and errors, difference [kind,
+    # size]. The 1e-10, far below any real variance, keep it invertible.
     effects = np.concatenate([kind.effects for kind in kinds], axis=1)
     inverse = np.linalg.inv(effects @ effects.mT + 1e-10 * np.eye(size) + errors)
     difference = split_complex(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
@@ -178,6 +187,8 @@ def _weigh_kinds_of_case(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEv
     library_share = float(np.mean(library_shares)) if first.in_library.any() else 0.0
     library_share = library_share / (library_share + LOOK_ALIKE_ODDS * (1 - library_share))
     weight = weight * np.where(first.in_library, library_share, 1 - library_share)
+
+    # Thin plates: the mean density over the drawn ones, [draw, scan].
     drawn_sheets = np.stack([kind.sheets for kind in kinds], axis=1)
     dispersion_weight = _weigh_dispersion(kinds, scan_evidence)
     density = _evaluate_normal(drawn_sheets, t, errors + SHEET_KERNEL**2 * np.eye(size))

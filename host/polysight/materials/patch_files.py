@@ -1,7 +1,8 @@
-"""`patches.npz`: the pixels of a scan's patches and what their names rest on, and the same patches in several scans.
+"""Write and read `patches.npz`, and find the patches that several scans have in common.
 
-The file holds the features of the pixels of all patches; `match_patches` finds the same patches in several scans, to
-name them together.
+The file holds, for each patch of a scan, the features of its pixels, and the evidence from which the patch is named:
+its ratio t = V / H relative to metal, with errors (`RatioEvidence`). It is the input of `polysight classify`, which
+names a patch that several scans show from all of them. `match_patches` finds these patches by their places.
 """
 
 from __future__ import annotations
@@ -26,20 +27,22 @@ from polysight.store import open_npz
 from polysight_shared.errors import DataError, ErrorCode
 
 PATCHES_FILE = "patches.npz"
+"""Name of the file in a scan's products."""
 PATCHES_FORMAT = "polysight-patches-1"
-"""Name of the file in a scan's products, and of its format: a file of another one is refused."""
+"""Name of the file's format; files of other formats are refused."""
 SAME_PATCH_MM = 20.0
-"""Largest distance between the centres of one patch in two scans. Chosen: less than half of a plate and its gap."""
+"""Largest distance between the centres of one patch in two scans. Chosen: less than half the distance between the
+centres of neighbouring plates."""
 NEAR_MM = 4.0
 """Largest distance between pixels of two scans that show the same spot: about the resolution."""
 
 
 @dataclass(frozen=True)
 class ScanPatch:
-    """A patch in one scan: its centre (mm from the image centre), the positions and features of its pixels.
+    """A patch in one scan, with the n pixels of its interior. Places are (x, y), millimetres from the image centre.
 
-    `places_mm` float64 [n, 2] from the image centre, `features` float64 [n, 4] of its interior, after the Gaussian
-    filter (`pixel_features`). `truth` is the true material, if known.
+    `centre_mm` is the middle of its box, `truth` its true material (None: not known). `places_mm` float64 [n, 2] are
+    the places of the pixels, `features` float64 [n, 4] their features after the Gaussian filter (`pixel_features`).
     """
 
     label: int
@@ -51,9 +54,10 @@ class ScanPatch:
 
 @dataclass(frozen=True)
 class ScanPatches:
-    """The patches of one scan; `evidence`: patch number to what its name rests on (earlier releases wrote none).
+    """The patches of one scan.
 
-    `angle_deg` is the mean incidence angle over the image; `simulated` is true if the scan was.
+    `angle_deg` is the mean incidence angle over the image. `simulated` is true if the scan was simulated. `evidence` is
+    patch number to the evidence for its name; it is empty in files of earlier releases.
     """
 
     angle_deg: float
@@ -69,11 +73,11 @@ class MatchedPatch:
     Attributes
     ----------
     label, truth
-        Number in the first scan, and true material, if known.
+        Number in the first scan, and true material; None if it is not known.
     features
-        float64 [n, 4 * scans] of the spots that all of them show.
+        float64 [n, 4 * scans]: features of the spots that all scans show, those of the first scan first.
     evidence
-        What each scan says of it; None if one of them does not say.
+        Evidence of each scan for the patch's name; None if a scan has none.
     """
 
     label: int
@@ -91,8 +95,8 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
     features = [np.zeros((0, 4))]
     for patch_result in result.patches:
         pixels = patch_result.patch.interior
-        iy, ix = np.nonzero(pixels)
-        places.append(np.stack([x[ix], y[iy]], axis=1))
+        row, column = np.nonzero(pixels)
+        places.append(np.stack([x[column], y[row]], axis=1))
         features.append(pixel_features(result.h[pixels], result.v[pixels], result.p[pixels]))
         truth = patch_result.truth.name if patch_result.truth else None
         rows.append(
@@ -100,12 +104,17 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
                 "label": patch_result.patch.label,
                 "centre_mm": patch_result.patch.centre_mm,
                 "truth": truth,
-                "pixels": int(ix.size),
+                "pixels": int(column.size),
             }
         )
-    angle = float(np.degrees(np.mean(result.theta_rad)))
-    judged = list(result.evidence)
-    meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows, "judged": judged}
+    meta = {
+        "format": PATCHES_FORMAT,
+        "angle_deg": float(np.degrees(np.mean(result.theta_rad))),
+        "simulated": simulated,
+        "patches": rows,
+        # Numbers of the patches with evidence: the first axis of the arrays "evidence_...".
+        "judged": list(result.evidence),
+    }
     evidence = result.evidence.values()
     buffer = io.BytesIO()
     np.savez_compressed(
@@ -114,6 +123,7 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
         places_mm=np.concatenate(places).astype(np.float32),
         features=np.concatenate(features).astype(np.float32),
         evidence_theta_rad=np.array([e.theta_rad for e in evidence], np.float64),
+        # The file's name is shorter than the field's: both are 1 / P, the ratio V / H.
         evidence_ratio=np.array([e.inverse_ratio for e in evidence], np.complex128),
         evidence_covariance=np.array([e.covariance for e in evidence], np.float64).reshape(-1, 2, 2),
         evidence_share=np.array([e.library_share for e in evidence], np.float64),
@@ -125,27 +135,33 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
 
 
 def _pack_dispersion(dispersion: PatchDispersion | None) -> Real:
-    """Return change, standard deviations, and the band in Hz, float64 [8]; NaN if they are not known."""
+    """Return three changes, their standard deviations, and the band in Hz, float64 [8]; all NaN for None."""
     if dispersion is None:
         return np.full(8, np.nan)
     return np.concatenate([dispersion.change, dispersion.std, dispersion.band_hz])
 
 
 def _unpack_dispersion(row: Real) -> PatchDispersion | None:
-    """Return what :func:`_pack_dispersion` packed; None if it is not known."""
+    """Return the dispersion of a row of :func:`_pack_dispersion`; None if a number is not finite."""
     if not np.isfinite(row).all():
         return None
     return PatchDispersion(row[:3], row[3:6], (float(row[6]), float(row[7])))
 
 
 def _pack_cases(cases: Sequence[RatioCase]) -> Real:
-    """Return probability, t and covariance of both cases, float64 [2, 7]; NaN if there is one."""
+    """Return the two cases (metal painted, metal bare), float64 [2, 7]; all NaN for no cases.
+
+    A row holds the probability, real and imaginary part of t = V / H, and the four numbers of their covariance.
+    """
     rows = [[case.probability, *split_complex(case.inverse_ratio), *case.covariance.flat] for case in cases]
     return np.array(rows) if rows else np.full((2, 7), np.nan)
 
 
 def _unpack_cases(rows: Real) -> tuple[RatioCase, ...]:
-    """Return what :func:`_pack_cases` packed. Raises ValueError for rows of another shape or without probabilities."""
+    """Return the cases of rows of :func:`_pack_cases`; none if the rows are NaN.
+
+    Raises ValueError for rows of another shape, or probabilities that are not positive or whose sum is not 1.
+    """
     known_rows = [row for row in rows.reshape(2, 7) if np.isfinite(row).all()]
     probabilities = [row[0] for row in known_rows]
     if known_rows and not (min(probabilities) > 0 and np.isclose(sum(probabilities), 1)):
@@ -177,14 +193,22 @@ def read_patches(path: Path) -> ScanPatches:
         ) from None  # fmt: skip
 
 
-def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> dict[int, RatioEvidence]:
-    """Return what the names of the judged patches rest on. Raises ValueError if the arrays do not fit."""
-    # Products of earlier states hold neither brightness nor dispersion nor cases.
-    brightness = arrays.get("evidence_brightness", np.full((len(judged), 2), np.nan))
-    dispersions = arrays.get("evidence_dispersion", np.full((len(judged), 8), np.nan))
-    cases = arrays.get("evidence_cases", np.full((len(judged), 2, 7), np.nan))
-    numbers = [arrays[f"evidence_{name}"] for name in ("theta_rad", "ratio", "covariance", "share")]
-    columns = zip(*numbers, brightness, map(_unpack_dispersion, dispersions), map(_unpack_cases, cases), strict=True)
+def _read_evidence(arrays: Mapping[str, npt.NDArray], labels: Sequence[int]) -> dict[int, RatioEvidence]:
+    """Return the evidence of the patches with these numbers. Raises ValueError if the arrays do not fit."""
+    # Files of earlier releases hold neither brightness nor dispersion nor cases.
+    brightness = arrays.get("evidence_brightness", np.full((len(labels), 2), np.nan))
+    dispersions = arrays.get("evidence_dispersion", np.full((len(labels), 8), np.nan))
+    cases = arrays.get("evidence_cases", np.full((len(labels), 2, 7), np.nan))
+    columns = zip(
+        arrays["evidence_theta_rad"],
+        arrays["evidence_ratio"],
+        arrays["evidence_covariance"],
+        arrays["evidence_share"],
+        brightness,
+        map(_unpack_dispersion, dispersions),
+        map(_unpack_cases, cases),
+        strict=True,
+    )
     rows = [
         RatioEvidence(
             theta_rad=float(angle), inverse_ratio=complex(ratio), covariance=covariance, library_share=float(share),
@@ -194,19 +218,22 @@ def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> 
     ]  # fmt: skip
     if any(row.covariance.shape != (2, 2) for row in rows):
         raise ValueError("covariances are not [patch, 2, 2]")
-    return dict(zip(map(int, judged), rows, strict=True))
+    return dict(zip(map(int, labels), rows, strict=True))
 
 
 def _read_patch(row: Mapping[str, Any], places: Real, features: Real) -> ScanPatch:
+    """Return a patch of the file. Raises KeyError, TypeError or ValueError if its row is damaged."""
     x, y = row["centre_mm"]
-    return ScanPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)
+    # As text, so that a number with a fraction raises ValueError: int(1.5) would be 1.
+    label = int(str(row["label"]))
+    return ScanPatch(label, (float(x), float(y)), row["truth"], places, features)
 
 
 def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     """Return the patches that all scans show at the same place, pixel by pixel.
 
-    Two patches match if their centres are each other's nearest and at most `SAME_PATCH_MM` apart. Pixels match by their
-    position in the patch, so that the scans' image centres may differ by up to half a patch.
+    Two patches match if their centres are each other's nearest and at most `SAME_PATCH_MM` apart. Pixels are matched by
+    their places relative to the centre of their patch, so that the images of two scans may be displaced.
     """
     matched = []
     for patch in scans[0].patches:
@@ -216,16 +243,19 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
         pairs = zip(scans, (patch, *partners), strict=True)
         evidence = tuple(scan.evidence[p.label] for scan, p in pairs if p.label in scan.evidence)
         places = patch.places_mm - patch.centre_mm
+        # Features of the first patch's pixels, and of the nearest pixel of each partner, [n, 4] each.
         columns = [patch.features]
         near_enough = np.ones(len(places), bool)
         for partner in partners:
             partner_places = partner.places_mm - partner.centre_mm
             if not len(partner_places):
+                # No pixel is in all scans. Any features do here: none of them is kept.
                 near_enough[:] = False
-                columns.append(columns[0])
+                columns.append(patch.features)
                 continue
             distance_mm, nearest_index = scipy.spatial.KDTree(partner_places).query(places)
             near_enough &= distance_mm <= NEAR_MM
+            # A pixel at no finite distance, which is not near enough, gets an index beyond the last one.
             columns.append(partner.features[np.minimum(nearest_index, len(partner_places) - 1)])
         complete = evidence if len(evidence) == len(scans) else None
         matched.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[near_enough], complete))

@@ -3,10 +3,11 @@
 Plates parallel to the stage are mirrors: the image is bright inside a plate and dark elsewhere. In dB, speckle is
 additive noise and plates are constant with steps between them: total variation removes the former and keeps the latter.
 Levels of plates differ by 25 dB (thin wood against metal), so a common threshold cannot give their edges. The threshold
-falls from the brightest level instead, and each region that grows with it is cut at half of its own amplitude, the
-position of the edge of a band-limited step. It is taken out with its *skirt*, the margin around it in which its level
-falls to the background. A region is a patch if it stands out from the background; bright ones that do not are left out
-(`Segmentation.left_out`). Where the true plates are known, `match_truth` finds each one's patch.
+falls from the brightest level instead, and each region that grows with it is cut at half of its own amplitude, which is
+where a band-limited step has its edge. Its pixels, and those of its *skirt* (the margin around it in which its level
+falls to the background), are then no longer searched. A region is a patch if it stands out from the background; bright
+ones that do not are left out (`Segmentation.left_out`). Where the true plates are known, `match_truth` finds the patch
+of each.
 
 Constants that name a real picture were measured on one that the authors of POLySIGHT published.
 """
@@ -31,18 +32,22 @@ Box = tuple[float, float, float, float]
 # Smallest weight of the smoothing, dB: an image without speckle would get a weight of 0.
 _LEAST_WEIGHT = 0.1
 EDGE_DB = 6.0
-"""A plate's edge is at half of its amplitude, the edge of a band-limited step."""
+"""A plate's edge is at half of its amplitude, -6 dB, as that of a band-limited step."""
 OVERFLOW_GROWTH = 1.5
-"""Growth within one step of the threshold by which a region runs into its background; chosen."""
+"""A region has run into its background if its area grows by more than this factor in one step of the threshold;
+chosen."""
 MOST_SCATTER_DB = 4.0
-"""Largest scatter of a background's level: that of a real picture is 3.8 dB; with more, plates are among the pixels."""
+"""Largest scatter of a background's level: that of a real picture is 3.8 dB. With more, some of the pixels that count
+as background show plates."""
 PLAIN_DB = 14.0
-"""Level above the background that noise hardly reaches over the width of the smallest patch. Of 200 images of noise
-alone 24 have a patch, 10 without this rule; all that it adds have speckle wider than 5.9 mm (standard deviation)."""
+"""Level above the background that noise hardly reaches over the width of the smallest patch. A region above it is a
+patch, although plates and background are not separate. Of 200 images of noise alone 24 have a patch, 10 without this
+rule; all those that it adds have speckle wider than 5.9 mm (standard deviation)."""
 SMALLEST_SHARE = 0.75
 """Least area of a patch, relative to a square of the least width: a corner of a skirt has 0.6."""
 BODY_SHARE = 0.65
-"""Parts of a region narrower than this share of its width do not belong to it. Chosen: more rounds corners."""
+"""Parts of a region narrower than this share of its width do not belong to it. Chosen: a larger share rounds corners.
+"""
 STEP_DB = 1.0
 """Step of the falling threshold; chosen."""
 BACKGROUND_PERCENT = 20.0
@@ -54,12 +59,12 @@ LEAST_POWER = 1e-12
 """Power relative to the brightest that counts as none; chosen."""
 LEAST_APART_MM = 0.4
 MOST_APART_MM = 10.0
-"""Distances between the images of H and V that are corrected: smaller ones are below its error (0.2 mm), and larger
-ones have no such cause."""
+"""Distances between the images of H and V that are corrected: the error of a distance is 0.2 mm, and larger ones are
+no displacement of the images."""
 EDGE_FLOOR = 0.05
 """Level relative to the brightest below which edges do not count; chosen."""
 LEAST_CORRELATION = 0.5
-"""Least correlation of the edges in H and V once they lie on each other: images of noise have less than 0.1."""
+"""Least correlation of the edges in H and V after V was moved onto H: images of noise have less than 0.1."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,7 @@ class SegmentSettings:
     least_contrast_db
         Least difference between a patch and its surroundings.
     least_scatter
-        The same relative to the scatter of the background's level, standard deviations.
+        Least difference between a patch and the background, in standard deviations of the background's level.
     """
 
     smallest_mm: float = 14.0
@@ -106,7 +111,7 @@ class Patch:
     Attributes
     ----------
     label
-        Its number in the label image, from 1: of found patches in reading order (top row first), of boxes in theirs.
+        Its number in the label image, from 1: found patches in reading order (top row first), drawn boxes in their own.
     box_mm
         (x0, y0, x1, y1) around it.
     outline_mm
@@ -404,7 +409,8 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
 
     The threshold falls from the brightest level, and connected regions grow with it. A region is complete when its
     median lies `EDGE_DB` above the threshold (half of its own amplitude), or before it runs into another region or into
-    a background that is not that far below. It is taken out with its skirt; the threshold falls further for the rest.
+    a background that is not that far below. Its pixels and its skirt are removed, and the threshold falls further for
+    the rest.
     """
     opening_px = (cfg.smallest_mm / pixel_mm - 1) / 2
     skirt_px = max(1.0, cfg.margin_mm / pixel_mm)
@@ -422,8 +428,8 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
         grown: list[_GrowingRegion] = []
         for region in _find_components(_open_mask((level > threshold) & remaining, opening_px)):
-            # Regions at the threshold before that have grown into this one, and those of them that stand out enough to
-            # be patches: two that meet, or one that runs over, are cut where they were.
+            # `parts`: regions of the previous threshold that have grown into this one. Those that stand out enough to
+            # be patches are cut back to an earlier threshold if two of them meet, or one runs into its background.
             parts = [node for node in growing if (node.mask & region).any()]
             standing_out = [node for node in parts if node.level_db - threshold >= cfg.least_contrast_db]
             overflows = any(region.sum() > OVERFLOW_GROWTH * node.mask.sum() for node in standing_out)
@@ -442,9 +448,9 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
 
 
 def _smooth_outline(mask: Mask) -> Mask:
-    """Fill the holes of a region, cut off parts narrower than `BODY_SHARE` of its width (speckle, bridges).
+    """Return a region without holes, and without parts narrower than `BODY_SHARE` of its width (speckle, bridges).
 
-    Of the rest the largest part stays, with a smooth outline.
+    Of what is left the largest part is returned, with a smooth outline.
     """
     # The Gaussian below ends after 4 pixels.
     window = _find_window(mask, 5)

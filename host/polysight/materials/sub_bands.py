@@ -1,12 +1,12 @@
-"""Fit a patch's ratios over the sub-bands of the sweep, or the concentration of a solution to its polarisation angle.
+"""Measure a patch's ratio in sub-bands of the sweep and fit layers to it; fit a concentration to a polarisation angle.
 
 Ratios in sub-bands of the sweep distinguish thin layers, whose reflection changes with frequency, from thick ones. The
-error of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and a part of
-its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their
-full covariance is stored.
+error of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and an
+independent part in each (noise, sidelobes). Differences between sub-bands are therefore known better than each ratio,
+and the full covariance of all sub-bands is stored.
 
-`add_bands` measures them; `bands_of_row` reads them back from a segment of materials.json (that is what files call a
-patch), and `fit_row` fits the unknown layer of a stack to it.
+`add_bands` measures the ratios for materials.json, which calls a patch a segment. `bands_of_row` reads them from a
+segment, and `fit_row` fits the unknown layer of a stack to them.
 
 The polarisation angle Phi = arctan |P| (Eq. 8 of the POLySIGHT paper) falls steadily as sugar is dissolved (section
 9.4). `fit_concentration` fits a straight line through known concentrations, which gives unknown ones with a prediction
@@ -49,23 +49,25 @@ from polysight_shared.errors import DataError, ErrorCode
 AMPLITUDE_ERROR = 0.1
 """Relative standard deviation of |H| of a patch by its size, edges and tilt, which do not affect ratios."""
 BAND_SHARE = 0.75
-"""Error of V / H of one sub-band relative to the others, per spread of the pixels about the whole sweep's V / H.
+"""Error of V / H of one sub-band relative to the others, divided by the spread over pixels of its difference from V / H
+of the whole sweep.
 
-All of these constants are measured in simulated scenes of layered plates (benchmarks/layers).
+The constants below are measured in simulated scenes of layered plates (benchmarks/layers), unless chosen.
 """
 BAND_STD = 5e-4
-"""Least value of that error, even with uniform pixels; chosen."""
+"""Smallest error of V / H of one sub-band relative to the others, even with uniform pixels; chosen."""
 BAND_AMPLITUDE_SHARE = 0.5
 BAND_AMPLITUDE_STD = 3e-3
-"""Error of ln |H| of one sub-band relative to the others, per spread of the pixels about the whole sweep's |H|, and its
-least value. In 42 scenes with metal among sheets the latter alone is too small; a share of 0.35 to 0.75 holds.
+"""Error of ln |H| of one sub-band relative to the others, divided by the spread over pixels of its ratio to |H| of the
+whole sweep; and the smallest error. In 42 scenes with metal among sheets the smallest error alone is too small, and a
+share of 0.35 to 0.75 is right.
 """
 LAYERED_STD_RAD = 2.5e-3
-"""Error of the incidence angle with layered plates: echoes from inside make their plane look farther, by 2.5 mm in
+"""Error of the incidence angle with layered plates: echoes from inside make their plane look farther away, by 2.5 mm in
 simulated scenes of layered plates only."""
 PHASE_PER_ANGLE = 4.5
-"""Phase of V / H in radians per radian of that error: H and V are illuminated from different points of a plane that is
-out of focus. Measured in the same scenes."""
+"""Phase of V / H in radians per radian of that error: the plane is out of focus, and H's board and V's see it from
+different points. Measured in the same scenes."""
 
 Real = npt.NDArray[np.float64]
 # A concentration in a material's name.
@@ -145,9 +147,9 @@ def list_band_rows(
 
 
 def _estimate_common_std(result: MaterialsResult, interior: Mask) -> float:
-    """Return the error, by scatter over the plate, that V / H of all its sub-bands have in common; NaN if not known.
+    """Return the error of V / H that all sub-bands of a plate have in common, from the scatter over the plate.
 
-    It is the standard deviation of each part.
+    It is the standard deviation of the real part, and of the imaginary part; NaN if it is not known.
     """
     images = result.calibrated
     scatter = measure_scatter(interior, result.h, result.v, images.x_m, images.y_m)
@@ -159,7 +161,7 @@ def _estimate_common_std(result: MaterialsResult, interior: Mask) -> float:
 
 
 def _add_covariance(rows: list[BandFigures], result: MaterialsResult, common: float) -> list[BandFigures]:
-    """Add the covariance of the errors to one patch's sub-bands; `common` is the deviation common to all of them."""
+    """Add the covariance of the errors to a patch's sub-bands; `common` is that of :func:`_estimate_common_std`."""
     ratios = [row.ratio.value for row in rows if row.ratio is not None]
     if len(ratios) < len(rows) or not math.isfinite(common):
         return rows
@@ -245,16 +247,16 @@ def bands_of_row(
     amplitude_error: float = AMPLITUDE_ERROR,
     theta_std_rad: float = 0.0,
 ) -> Bands | None:
-    """Return the input of :func:`polysight.materials.layers.fit_layer` from a row of materials.json.
+    """Return the input of :func:`polysight.materials.layers.fit_layer` from a segment of materials.json.
 
     Parameters
     ----------
     row
-        One segment.
+        The segment.
     chirp
         Chirp of the scan.
     count
-        Number of sub-bands: as in the row, or 1 for the whole sweep.
+        Number of sub-bands: as in the segment, or 1 for the whole sweep.
     amplitude_error
         Relative standard deviation of |H|, common to all sub-bands; 0: |H| is not used.
     theta_std_rad
@@ -290,7 +292,7 @@ def bands_of_row(
     if count > 1 and len(shared) == count:
         covariance = np.array([line for lines in shared for line in lines], np.float64)
     else:
-        # Products of earlier releases have no covariance: K bands are then no better than one (count = 1 is kept).
+        # One band, or a product of an earlier release without covariance: K bands are then no better than one.
         sigma = np.sqrt(count) * sigma
     theta_std = 0.0
     phase_per_angle = 0.0
@@ -509,10 +511,12 @@ class Line:
 
 @dataclass(frozen=True)
 class LeftOutPatch:
-    """Estimate of one patch by a line fitted without its concentration."""
+    """Estimate of one patch by a line fitted without its concentration.
+
+    `name` is that of the material; the others are percent by weight: known, estimated, ends of the prediction interval.
+    """
 
     name: str
-    # Percent by weight: known, estimated, and the ends of the prediction interval. `name` is that of the material.
     true_percent: float
     percent: float
     low: float

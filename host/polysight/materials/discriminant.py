@@ -73,7 +73,7 @@ def estimate_common_error(mean: Real, own_errors: Real, prior: Real, level: floa
     `mean` [patch, materials, d] are the deviations of patches from the materials, `own_errors` [materials, d, d] the
     covariances of these, `prior` [d, d] that of the error. Patches whose squared distance to every material is above
     `level` have little weight. Expectation maximisation: a patch of uncertain material counts with the moments of the
-    mixture. A single patch says nothing about it.
+    mixture. From a single patch the error cannot be estimated: its prior is returned.
     """
     value = np.zeros(len(prior))
     covariance = prior
@@ -83,6 +83,7 @@ def estimate_common_error(mean: Real, own_errors: Real, prior: Real, level: floa
         distance2, cost = costs(mean - value, own_errors + covariance)
         share = shares_of_materials(cost)
         weight = scipy.special.expit(level - distance2.min(axis=1))
+        # Mean and covariance of each patch over the materials: p patches, k materials, d and e features.
         middle = np.einsum("pk,pkd->pd", share, mean)
         difference = mean - middle[:, None]
         spread = np.einsum("pk,pkde->pde", share, own_errors + difference[..., :, None] * difference[..., None, :])
@@ -141,12 +142,12 @@ class ErrorDiscriminant(Model):
         scan = np.unique(samples.groups, return_inverse=True)[1][first]
         plate = samples.plates[first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
-        # Metal-like patches have no error of their own, and say nothing about the errors of scans.
+        # Metal-like patches have no error of their own, and do not show the errors of scans.
         informative = ~self._find_metal_like(samples.x, patch)
         if not informative.any():
             informative[:] = True
 
-        # Means of materials and offsets of scans; what they leave of a patch is its own error.
+        # Means of materials and offsets of scans; the rest of a patch's mean is its own error.
         offset, self.level = _fit_two_way(mean, material, scan, informative)
         self.pixels = float(np.median(count))
         self.placements = np.bincount(material).astype(float)
@@ -161,11 +162,11 @@ class ErrorDiscriminant(Model):
             _compute_covariance(pixel[is_used], max(int(is_used.sum() - informative.sum()), 1))
         )
         self._effects = self._compute_specimen_effects()
-        # The only patch of a material is its mean: its residual of zero says nothing about errors.
+        # The only patch of a material is its mean: its residual is zero whatever its error.
         repeated = informative & (np.bincount(material[informative], minlength=self.names.size)[material] > 1)
         if not repeated.any():
             repeated = informative
-        # The fitted means took degrees of freedom, and variance, from the residuals: they are scaled up for it.
+        # The fit of the means reduced the variance of the residuals: they are scaled up for it.
         self._fit_patches(residual[repeated] * np.sqrt(repeated.sum() / dof), material[repeated], plate[repeated], dof)
         patches_per_scan = max(informative.sum() / scans, 1.0)
         common = self._decorrelate_angles(_compute_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
@@ -346,13 +347,14 @@ class ErrorDiscriminant(Model):
     def _set_thresholds(
         self, patches: Real, material: npt.NDArray, pixels: Real, pixel_material: npt.NDArray, dof: float
     ) -> None:
-        """Set the squared distances that known materials exceed with probability REJECTED.
+        """Set the squared distances that known materials exceed with probability `REJECTED_SHARE`.
 
         `patches` and `pixels` are deviations from their material's mean, [patches, d] and [n, d], `material` and
         `pixel_material` its index.
 
-        The larger of Hotelling's distribution, for an estimated mean and covariance, and the quantile of the library's
-        own patches (each left out of its material's mean). Without enough patches there is no threshold.
+        A threshold is the larger of two: that of Hotelling's distribution, for an estimated mean and covariance, and
+        the quantile of the library's own patches (each left out of its material's mean). Without enough patches there
+        is no threshold.
         """
         width = patches.shape[1]
         freedom = max(dof - width + 1, 1)
@@ -363,7 +365,7 @@ class ErrorDiscriminant(Model):
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
 
         def find_left_out_quantile(deviations: Real, index: npt.NDArray, covariances: Real) -> float:
-            """Return the squared distance that a share REJECTED of the library's own deviations exceeds."""
+            """Return the squared distance that a share `REJECTED_SHARE` of the library's own deviations exceeds."""
             d = deviations * left_out[index]
             distance2 = np.einsum("nd,nde,ne->n", d, np.linalg.inv(covariances)[index], d)
             return float(np.quantile(distance2, 1 - REJECTED_SHARE))

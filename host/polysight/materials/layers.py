@@ -1,16 +1,19 @@
-"""Stacks of layers: sheets thinner than the wave, sheets on metal, liquids behind a container's wall; their fit.
+"""Model and fit stacks of layers: sheets thinner than the wave, sheets on metal, liquids behind a container's wall.
 
 Eq. 3 of the POLySIGHT paper (the permittivity of a half space from the ratio of H to V and the incidence angle) holds
 for one interface. A sheet has two, a filled container three, and the echoes of the rear ones are as strong as the
-first. Here the model is the whole stack (:func:`polysight.polarimetry.multilayer`), and the data are those of the
-sub-bands of the sweep (`Spectrum`, `Bands`).
+first. Here the model is the whole stack (:func:`polysight.polarimetry.multilayer`), and the data are V / H and |H| in
+the sub-bands of the sweep (`Spectrum`, `Bands`).
 
 `fit_layer` fits the one unknown layer: its permittivity, and its thickness if it is not known. The solution has the
-least chi-square, with the full covariance of the data (errors common to all sub-bands do not average out, differences
-between them are known better) and the incidence angle as a nuisance with its prior. Start values come from a grid over
-index, loss and phase, so that no branch (half a wave more in the sheet) is missed. Error bars are those of the
-curvature, or of samples of the posterior if the valley is bent. Other solutions that the data do not exclude are listed
-as rivals.
+least chi-square
+
+    (data - model)^T C^-1 (data - model) + (error of the incidence angle / its standard deviation)^2
+
+with the full covariance C of the data: errors common to all sub-bands do not average out, differences between them are
+known better. Start values come from a grid over index, loss and phase, so that no local minimum (half a wave more in
+the sheet) is missed. Error bars follow from the curvature at the minimum, or from samples of the posterior if the
+valley of chi-square is bent. Other solutions that the data do not exclude are listed as rivals.
 """
 
 from __future__ import annotations
@@ -248,13 +251,13 @@ THICKNESS_RANGE_M = (0.1e-3, 12e-3)
 START_PHASE_RAD = 0.25
 """Step of the start grid in the phase of the path through the layer and back: no valley is narrower."""
 # Grid of start values: loss tangents, number of indices, and number of its local minima that are solved; chosen.
-# "Index" here and below is sqrt(eps' - sin^2), the wave vector along the normal over that in vacuum.
+# "Index" here and below is sqrt(eps' - sin^2): the wave vector's component along the normal, relative to vacuum.
 LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
 INDEX_STEPS = 60
 STARTS_SOLVED = 24
 RIVAL_CHI2 = 9.0
-"""A second solution is a rival if its chi-square is within this of the best: three standard deviations, enlarged as the
-error bars if the model misses the data."""
+"""A second solution is a rival if its chi-square is at most this above the best one: three standard deviations. The
+limit is enlarged, as the error bars are, by the chi-square per degree of freedom if that is above 1."""
 MAX_THICKNESS_M = 30e-3
 """Largest thickness to fit; chosen."""
 UNLIKELY_PROBABILITY = 1e-3
@@ -290,7 +293,7 @@ class LayerFit:
     chi2, freedom
         Sum of squared residuals over their deviations; data minus unknowns.
     rivals
-        Other solutions that the data do not exclude (chi-square within 9, or more if the model misses the data).
+        Other solutions that the data do not exclude (`RIVAL_CHI2`).
     at_limit
         Unknowns at an end of their search range, except a loss of zero.
     covariance
@@ -475,9 +478,10 @@ def _drop_repetitions(solutions: Sequence[_Solution], level: float, relative: fl
 
 
 class _Model:
-    """Residuals of one fit. Unknowns: eps', eps'', the thickness in mm if fitted, the angle's error over its deviation.
+    """Residuals of one fit.
 
-    The last only if the angle has a deviation; it is not an unknown of the layer and has its own residual (the prior).
+    Unknowns are eps', eps'', the thickness in mm if it is fitted, and the error of the incidence angle in standard
+    deviations if it has one. The last is not counted as an unknown of the layer; its prior is a residual of its own.
     """
 
     def __init__(
@@ -621,7 +625,7 @@ class _Model:
         thickness_m = self.stack[self.layer_index].thickness_m
         if self.fits_thickness:
             thickness_m = float(solution.x[2]) * 1e-3
-        # The last says if the lower end counts: a loss of zero is not a limit of the search.
+        # The last column is true if the lower end is a limit of the search, which a loss of zero is not.
         ends = zip(("the real part", "the loss", "the thickness"), solution.active, (True, False, True), strict=False)
         return LayerFit(
             permittivity=complex(solution.x[0], -solution.x[1]),

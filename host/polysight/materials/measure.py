@@ -26,13 +26,13 @@ from polysight_shared.findings import Finding
 
 AMPLITUDE_OF_BLOCKS = 0.85
 PHASE_OF_BLOCKS = 0.75
-"""Errors of a plate's ln|V / H| and of its phase, times the root of its independent places, over its pixels' scatter.
+"""Error of a plate's ln|V / H|, and of its phase = this * scatter of its pixels / sqrt(number of independent places).
 
-Speckle averages out; edges, neighbours and ripple are correlated over 10 to 20 mm, `BLOCK_M`, and average as slowly.
+Speckle averages out. Edges, neighbours and ripple are correlated over 10 to 20 mm: one place is `BLOCK_M` wide.
 Errors of 2,500 plates of the independent generator are described best by 0.8 and 0.6; a little more is kept (chosen).
 """
 USUAL_BLOCKS = 2.0
-"""Weight of the scene's usual scatter against a plate's own, in independent places of the plate; chosen."""
+"""Weight of the scene's usual scatter in the mean with a plate's own, which weighs as many as its places; chosen."""
 BLOCK_M = 0.012
 """Length over which the errors of V / H within a plate are correlated."""
 LEAST_STD = 0.6e-3
@@ -47,16 +47,16 @@ BORDER_M = 0.017
 BORDER_STD = (0.05, 0.03)
 BORDER_POWERS = (4.0, 1.5)
 MOST_BORDER_STD = 0.2
-"""Errors of a plate's ln|V / H| and of its phase where the middle of its pixels lies `BORDER_M` inside the end of what
-the aperture lights, the powers of this distance with which they fall, and the largest one. In drawn scenes with small
+"""A plate whose pixels lie at the distance d (median) inside the border of the lit area has the errors BORDER_STD *
+(BORDER_M / d)^BORDER_POWERS of ln|V / H| and of its phase, at most MOST_BORDER_STD. In drawn scenes with small
 apertures (own simulator, leakage known) 68 % of plates are within 0.156 and 0.055 at 13 mm, 0.03 and 0.025 at 19 mm,
-0.013 and 0.018 at 26 mm, and within 0.013 and 0.009 far from it."""
+0.013 and 0.018 at 26 mm, and within 0.013 and 0.009 far from the border."""
 DISPERSION_STD = (0.006, 0.008)
 DISPERSION_SHARE = 0.5
 DISPERSION_BEHIND = 1.0
-"""Least errors of a half space's change of ln |H| and of ln(V / H) over the sweep, and the shares that count of its
-pixels' scatter and the metal's, and of what lies behind it. Half spaces in scenes of the independent generator with
-single nuisances: 0.002 rms in H; in the demo's scene, before a table, 0.85 of what lies behind."""
+"""Error of a half space's change of ln |H|, and of ln(V / H), over the sweep: the root of the squares of a least error,
+of a share of the scatter of its pixels and the metal's, and of a share of what lies behind it. Half spaces in scenes of
+the independent generator with single nuisances have 0.002 rms in H, in the demo's scene 0.85 of the table behind."""
 Real = npt.NDArray[np.float64]
 
 LEAST_PIXELS = 12
@@ -67,18 +67,18 @@ LEAST_LEVEL = 2.0
 """Least |H| of a patch over the background's root mean square; chosen."""
 ODD_SHARE = 0.15
 ODD_RATIO = 0.15
-"""Share of pixels that are this far from the median V / H above which a patch holds several materials; both chosen."""
+"""A pixel is odd if it differs from the median V / H by more than ODD_RATIO. A patch with a larger share of odd pixels
+than ODD_SHARE holds several materials; both chosen."""
 RIPPLE_SHARE = 0.5
-"""Distance from the median V / H, relative to it, up to which no pixel is odd, either: real metal ripples by 25 % and
-13 degrees, so that a tenth of its pixels lie two standard deviations of 0.24 away."""
+"""No pixel is odd that differs less than this share of the median: real metal ripples by 25 % and 13 degrees."""
 HALVES_APART = 0.07
 """Difference of V / H between opposite halves of a dielectric (thrice for metal), above which two materials touch. A
 real plate of one material (acrylic, published rig) has 0.06 after the factor for its V / H."""
 ODD_NOISE = 2.0
-"""Size of V's noise in V / H, over its root mean square, that makes no pixel odd: 2 % of noise exceeds it."""
+"""Nor is a pixel odd that differs by less than this times the rms noise of V / H by V: 2 % of noise exceeds it."""
 NOISE_OF_HALVES = 22.0
-"""Difference of the halves' medians by noise in V / H, times the root of the pixels, over the noise's root mean square:
-three standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
+"""Largest difference of the halves' medians by noise = this * rms noise of V / H / sqrt(number of pixels): three
+standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
 DIM_V_RATIO = 0.12
 """|V| over |H| below which the phase between both is not judged; chosen."""
 LEAST_COHERENCE = 0.7
@@ -396,11 +396,11 @@ def measure_patch(
 
 
 def estimate_border_errors(patch: Patch, lit: Mask, x_m: Real) -> tuple[float, float]:
-    """Return the errors of a patch's ln|V / H| and of its phase by the end of what the aperture lights.
+    """Return the errors of a patch's ln|V / H| and of its phase near the border of the lit area (`BORDER_STD`).
 
     `lit`, bool [ny, nx]: illuminated pixels, in the images of a separate metal plate, too; `x_m` [nx]: the image's
-    axis. A patch that fills them has no such errors, for the metal was lit in the same way. The image's border is such
-    an end for patches that reach it.
+    axis. A patch that fills them has no such errors, as the metal was lit in the same way. For patches that reach the
+    border of the image, this is a border of the lit area, too.
     """
     if not patch.interior.any() or not (lit & ~patch.mask).any():
         return 0.0, 0.0

@@ -1,12 +1,13 @@
-"""The direct path in recorded bursts: start offset, delay and crystal error, and the receivers' high-pass filters.
+"""Estimate start offset, start delay and crystal error of a board, and its high-pass filter, from the direct path.
 
-IF of the direct path with delay tau, start delay dt of the board relative to the transmitter, and relative frequency
-error p of the board's crystal, at the time t after the first sample, at which the chirp has f_0 and the slope K:
+The IF of the direct path at the time t after the first sample is
 
     f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
 
-A crystal error makes the IF drift by 2 p K within a chirp, which separates it from dt. `fit_start` estimates the start
-offset that puts the direct path in the middle of the IF band.
+with tau the delay of the direct path, dt the start delay of the board relative to the transmitter, p the relative
+frequency error of the board's crystal, f_0 the transmit frequency of the first sample, and K the slope of the chirp.
+A crystal error makes the IF drift by 2 p K within a chirp, which distinguishes it from dt. `fit_start` estimates the
+start offset that puts the direct path in the middle of the IF band.
 
 `fit_filter` fits a high-pass filter to scans of one scene at several start frequencies: each puts the direct path at
 another IF, and trigger jitter spreads it by about 200 kHz. The direct path itself does not change, so its level over IF
@@ -37,9 +38,9 @@ PASSBAND = 0.9
 # Rows of a scan used by `fit_start`, and by `fit_filter`, which spreads their chirps over many bins of the IF; chosen.
 START_ROWS = 4
 FILTER_ROWS = 6
-# Smallest share of chirps with a direct path that a start offset is estimated from. Chosen.
+# Smallest share of chirps with a direct path with which a start offset is estimated; chosen.
 MIN_FOUND = 0.25
-# Bins of the filter's response; chirps and SNR (power ratio) that each needs; chosen.
+# Width of a bin of the filter's response, and the chirps and the SNR (power ratio) that each needs; chosen.
 BIN_HZ = 10e3
 MIN_CHIRPS = 6
 MIN_SNR = 20.0
@@ -52,7 +53,7 @@ class DirectSignal:
     Attributes
     ----------
     if_hz
-        float64 [chirp]: IF in the chirps with a direct path; within the receiver's band, so it may be aliased.
+        float64 [chirp]: IF in the chirps with a direct path, as sampled: it may be aliased.
     power, noise_power
         float64 [chirp]: squared amplitude as recorded (high-pass filter not compensated, noise included), and the
         noise power in it; ADC counts squared.
@@ -157,7 +158,7 @@ def find_direct(
     # of the estimator has the weights of the amplitude.
     share_of_noise = (np.abs(setup.path.estimator[0]) ** 2).sum() / sync.FOLD
     noise = _estimate_recorded_noise(aligned, referenced.noise) * share_of_noise
-    # Cycles a sample repeat after one: bring them into the receiver's band.
+    # Frequencies that differ by a whole cycle per sample are the same: bring them into the receiver's band.
     if chirp.if_mode == "complex1x":
         cycles = cycles % 1.0
     else:
@@ -248,8 +249,8 @@ def choose_start_offset(
 ) -> BoardStart:
     """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band.
 
-    `expected_hz` is its IF by the rig file, which gives the number of sample rates by which it is aliased; `error_hz`
-    is the standard error of `seen_hz` over `chirps` chirps. The offset is rounded to 1 Hz.
+    `expected_hz` is the IF of the direct path by the rig file, from which the number of sample rates follows by which
+    it is aliased. `error_hz` is the standard error of `seen_hz` over `chirps` chirps. The offset is rounded to 1 Hz.
     """
     rate = rig.chirp.sample_rate_hz
     middle = sum(band_hz(rig)) / 2
@@ -355,7 +356,7 @@ def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple
         [(residual(logs + d) - residual(logs - d)) / (2 * step) for d in step * np.eye(logs.size)], axis=1
     )
     misfit = residual(logs)
-    # Least squares: covariance of the logs; its parameters are the corners and the level, which the mean takes away.
+    # Least squares. The parameters are the corners and the level, which the subtraction of the mean fits.
     variance = float(misfit @ misfit) / max(1, misfit.size - logs.size - 1)
     errors = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)) * variance)
     return errors * corners_hz, float(np.sqrt(np.mean(misfit**2)) * 20 / np.log(10))

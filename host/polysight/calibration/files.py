@@ -134,7 +134,7 @@ class BoardFilter(msgspec.Struct, frozen=True):
     if_to_khz: float
     # Number of chirps with a direct path.
     chirps: int
-    # Root mean square of the levels less those of the filter.
+    # Root mean square of the measured levels minus those of the fitted filter.
     residual_db: float
 
 
@@ -177,13 +177,14 @@ class MetalFile(CalibrationFile, frozen=True, kw_only=True):
 
 
 class SphereFile(CalibrationFile, frozen=True, kw_only=True):
-    """`sphere`: points of a metal sphere, the reference of surfaces; gains are learnt from them with the rig in use.
+    """`sphere`: points of a metal sphere, the reference of surfaces; gains follow from them with the current rig.
 
-    `points`: by channel ("h", "v") rows of stage offset x, y, z, path (m), its slope x, y and curvature xx, xy, yy (1 /
-    m), amplitude's real and imaginary part and their standard deviation, and the amplitude's rise over the band
-    (`surfaces.window.Echoes.band_rise`), which files of earlier releases do not have. `radius_mm` is the sphere's own,
-    `radius_found_mm` that of the points' curvature; `centre_mm` (rig frame) lies one true radius behind the points,
-    whose distances from the sphere scatter by `misfit_mm` (median deviation); `gain_std` is that of ln(H / V).
+    `points` is channel ("h", "v") to points. A point has twelve numbers: stage offset x, y, z; path (m), its slope x, y
+    and its curvature xx, xy, yy (1 / m); real part, imaginary part and standard deviation of the amplitude. A
+    thirteenth is the amplitude's rise over the band (`surfaces.window.Echoes.band_rise`), which files of earlier
+    releases do not have. `radius_mm` is the true radius, `radius_found_mm` that by the curvature of the points.
+    `centre_mm` (rig frame) lies one true radius behind the points, whose distances from the sphere have the median
+    deviation `misfit_mm`. `gain_std` is the standard deviation of ln(H / V).
     """
 
     radius_mm: float

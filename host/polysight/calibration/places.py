@@ -1,16 +1,15 @@
-"""Positions of the receivers and of the object plane, from a scan of points at known positions.
+"""Estimate the positions of the receivers and of the object plane from a scan of a target with points at known places.
 
-Samples are referenced to the direct path, so the echo of a point at v, at stage offset u, has the phase
-2 pi f d / c with the excess path
+Samples are referenced to the direct path, so the echo of a point at v, at stage offset u and frequency f, is
 
-    d = |v - u - tx| + |v - u - rx| - |tx - rx|
+    A exp(2 pi j f d / c) / (|v - u - tx| |v - u - rx|),    d = |v - u - tx| + |v - u - rx| - |tx - rx|
 
-The position of the transmitter in the rig file defines the frame. Unknowns are the shift of each receiving board (3),
-the distance of the plane (1), and position (2) and rotation (1) of the target. The amplitude of each point is a free
+with the excess path d. The position of the transmitter in the rig file defines the frame. Unknowns are the shift of
+each receiving board (3), the distance of the plane (1), and position (2) and rotation (1) of the target. They are
+fitted by least squares over positions, RX and frequencies, with whitened noise. The amplitude A of each point is a free
 complex number per board, eliminated by variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973), so that
-only phase differences over aperture and frequency count. Least squares over positions, RX and frequencies, with
-whitened noise. Each unknown has a prior (the accuracy of a ruler): an unknown that the scan does not determine stays
-near the rig file, with the prior as its standard error.
+only phase differences over aperture and frequency count. Each unknown has a prior (the accuracy of a ruler): an unknown
+that the scan does not determine stays near the rig file, with the prior as its standard error.
 """
 
 from __future__ import annotations
@@ -37,17 +36,18 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = NDArray[np.float64]
 
-# Largest deviation of the plane from the rig file that the range gate holds; chosen.
+# Largest deviation of the plane from the rig file for which the range gate contains the target's echoes; chosen.
 DEPTH_M = 0.02
-# Positions used by the fit (more take longer and add little), and by the search for the target.
+# Positions used by the fit; more take longer and improve it little.
 POSITIONS = 400
+# Positions used by the search for the target.
 _SEARCH_POSITIONS = 100
-# Range of the search and its step, less than half a resolution cell.
+# Largest displacement of the target along x and y in that search, and its step: less than half a resolution cell.
 _REACH_MM = 12.0
 _STEP_MM = 1.5
-# Noise power of a component of the reduced samples, relative to the largest, below which it is empty; chosen.
+# A component of the reduced samples is left out if its noise power is less than this part of the largest; chosen.
 _MIN_NOISE = 1e-3
-# Part of the power that the points must explain; with less, another target or other objects were seen. Chosen.
+# Part of the power that the points must explain; with less, another target or other objects were scanned. Chosen.
 _MIN_EXPLAINED = 0.3
 
 
@@ -71,7 +71,7 @@ class Prior:
     board_mm: float = 5.0
     # Offset of the target's plane.
     plane_mm: float = 5.0
-    # Place of the target along x and along y.
+    # Displacement of the target along x and along y.
     target_mm: float = 10.0
     # Rotation of the target in its plane.
     turn_deg: float = 2.0
@@ -280,7 +280,7 @@ def _subtract_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDAr
 
 
 def _find_target(boards: list[BoardEchoes], centre: Real, points_mm: Real) -> tuple[float, float]:
-    """Return the position of the target on a coarse grid, millimetres: maximum of the power at all points."""
+    """Return the displacement of the target (x, y) on a coarse grid, millimetres, with the most power at its points."""
     best = -1.0
     best_place = (0.0, 0.0)
     small_boards = [_take_some_positions(b) for b in boards]

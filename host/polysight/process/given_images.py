@@ -1,8 +1,8 @@
-"""Images of another program as input: an `.npz` file, or a folder `labels/<scan>` of the published data.
+"""Find materials in images that another program formed: an `.npz` file, or a folder `labels/<scan>` of published data.
 
-`read_given_images` reads the pair and says what had to be assumed; `analyse_given_images` finds materials and verdict
-as for a recorded scan. There are no rows, no direct path and no antennas behind such images: the incidence angle is
-taken from the option, the file or the rig file, in this order, and the verdict is "usable with care" at best.
+`read_given_images` reads the images of H and V and lists what had to be assumed; `analyse_given_images` finds materials
+and verdict as for a recorded scan. For such images neither rows nor direct path nor antennas are known: the incidence
+angle is taken from the option, the file or the rig file, in this order, and the verdict is "usable with care" at best.
 """
 
 from __future__ import annotations
@@ -55,14 +55,15 @@ MAX_UNEVENNESS = 0.01
 """Largest relative deviation of the distance of two pixels from the mean one, and of the pitch in y from that in x;
 chosen."""
 OTHER_SIGN = 0.3
+"""Prior probability that the phases of another program's images have the opposite sign of ours (a permittivity is
+eps' - j eps''), if the file does not say it. Chosen: the patches decide where they can."""
 PUBLISHED_OTHER_SIGN = 0.05
-"""Probability a priori that images of another program are the conjugates of ours (in which a loss is -j eps''), if
-their file does not say it; and that published ones still are after `restore_phase_sign`, which conjugates them on
-reading. Chosen: the patches decide where they can."""
+"""The same for published images, which `restore_phase_sign` conjugates on reading; chosen."""
 MOST_RAISED_M = 0.1
 """Largest distance of a plate's plane from that of the others; chosen."""
 LEAST_PHASE_RAD = 1e-4
-"""Phase of V against H, or its distance from pi, which some pixel must exceed: noise alone gives far more; chosen."""
+"""The phase of V against H must differ from 0 and from pi by more than this in some pixel. Chosen: noise alone gives
+far more."""
 LEAST_PEAK = 1e-9
 MOST_PEAK = 1e9
 """Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
@@ -383,8 +384,8 @@ def _find_raised(
 def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     """Read `labels/<scan>`; row 0 of its images is the top of the published pictures, the largest y."""
     scan = materials.read_labelled_scan(folder)
-    # From which row the boxes count y, and whether rows are y at all, is not documented: the images are turned to where
-    # the boxes explain most of their brightness.
+    # It is not documented from which row the boxes count y, and whether rows are y at all: the images are turned so
+    # that the boxes explain most of their brightness.
     orientation = materials.image_orientation([scan])
     scan = scan.orient(orientation)
     arrays = {"h": scan.h, "v": scan.v}
@@ -501,12 +502,12 @@ def list_reasons_of_given_images(pair: GivenPair, angle: Angle) -> list[Finding]
 
 
 TOLD_TILT_DEG = 0.5
-"""Tilt of a plate across the plane of incidence from which on the verdict reports how its polarisations were turned;
-chosen."""
+"""Tilt of a plate across the plane of incidence above which the verdict reports that the correction of the turned
+polarisations assumes the rig file's antennas; chosen."""
 
 
 def turn_reasons(result: materials.MaterialsResult) -> list[Finding]:
-    """Return what limits the verdict if plates are tilted: images do not say to which side the antennas are turned."""
+    """Return what limits the verdict if plates are tilted: images do not show to which side the antennas are turned."""
     tilted = [
         r.patch.label
         for r in result.patches
@@ -524,7 +525,7 @@ def turn_reasons(result: materials.MaterialsResult) -> list[Finding]:
 
 REPORTED_PAINT = 0.2
 REPORTED_SIGN = 0.02
-"""Probability of paint and of the other sign from which on the verdict reports them; chosen."""
+"""Probabilities of paint and of the other sign above which the verdict reports them; chosen."""
 
 
 def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> list[Finding]:
@@ -596,7 +597,7 @@ def analyse_given_images(
     if plane is not None and scene.metal is None:
         images = images.limit_to_area(plane.valid_on(images.x_m, images.y_m))
         scene = replace(scene, metal=plane)
-    # The specular angle, and the pixels' own: without a raster these are the same.
+    # `IncidenceChoice` takes the specular angle, and the angle of each pixel: without a raster these are the same.
     everywhere = incidence_on_planes(np.full(images.h.shape, np.radians(angle.deg)), images.raised_m, rig)
     optics = materials.Optics.from_rig(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)

@@ -1,4 +1,8 @@
-"""The verdict on a processed scan, and the error budget of its results: evidence of recording, rig and scene."""
+"""Form the verdict on a processed scan, and the error budget of its results.
+
+The rules in `results` make a finding of a figure; this module takes the figures from the recording (`Quality`) and from
+the scene (`MaterialsResult`) and applies them. The reasons of the verdict are the findings that lower it.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +35,7 @@ from polysight_shared.findings import Finding
 def recording_verdict(quality: Quality) -> list[Finding]:
     """Return reasons from recording and synchronisation: rows, frames, manifest, and the direct path of each board."""
     coverage = quality.coverage()
-    # With RX in another order a direct path is lost, and positions are masked: that is no finding of its own.
+    # With RX in another order the direct path is lost, so that positions are masked: these are not reported, too.
     boards_in_order = [board for board in quality.boards.values() if not board.rx_order]
     positions = sum(b.positions for b in boards_in_order)
     masked = sum(b.positions_masked for b in boards_in_order)
@@ -48,7 +52,7 @@ def recording_verdict(quality: Quality) -> list[Finding]:
             continue
         share_with_path = _divide(board.positions - board.positions_masked, board.positions, default=0.0)
         received = _divide(board.frames_received, board.frames_expected, default=0.0)
-        # Positions without a whole frame have no direct path either; do not count that loss twice.
+        # Positions without a whole frame have no direct path either: count only those that were received.
         share_of_received = _divide(share_with_path, received, default=1.0)
         missing += rules.judge_direct_path(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
         missing += _report_disturbances(name, list(board.figures.values()))

@@ -1,7 +1,7 @@
 """Quality of a processed scan: the figures of quality.json, by row, board and scan; `judge.py` has the verdict on them.
 
-`Quality` collects frames received, positions masked, synchronisation residuals and run time, and what only all rows of
-a board show together: the order of its RX, and jumps of its phase (`row_phases.py`).
+`Quality` collects frames received, positions masked, synchronisation residuals and run time. It also holds what is
+found from all rows of a board together: the order of its RX, and jumps and drift of its phase (`row_phases.py`).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ from polysight_shared.raster import plan_raster
 
 # Nothing is calibrated.
 NO_FILES: Mapping[str, CalibrationSource] = {}
-# Least share of a board's rows that tell another order of the RX; chosen.
+# Least share of a board's rows that must show the same other order of the RX; chosen.
 OTHER_ORDER_SHARE = 0.1
 Count = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -75,7 +75,7 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     frames_expected, frames_received
-        Frames of the row, and those that were received whole; counted in chirps, for most frames hold one.
+        Frames of the row, and those that were received whole. A frame is one chirp here.
     bytes_missing, crc32
         Bytes of raw data that are missing, and the digest of the recorded payload ("" without one).
     positions, positions_masked
@@ -85,8 +85,8 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     stages
         Each stage of synchronisation with the standard deviations after it: Hz, rad, and relative amplitude.
     chirps_clipped, chirps_disturbed, positions_clipped
-        Chirps left out because the receiver clipped or because they differ from the rest of their burst, and positions
-        of which all chirps clipped; 0 in files of earlier releases, which did not look for them.
+        Numbers of chirps left out because the receiver clipped, and because they differ from the rest of their burst;
+        number of positions of which all chirps clipped. 0 in files of earlier releases, which did not count them.
     dead_rx
         RX without a signal, counted from 1.
     rx_order
@@ -146,7 +146,7 @@ class BoardRows:
     rows: dict[int, RowQuality] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Prepare the filters that single out the object's echo, one for samples and one for blocks of them."""
+        """Prepare the filters that select the object's echo: one for rows of samples, one for rows of blocks."""
         sweeps = sample_frequencies_hz(self.rig.chirp), block_frequencies_hz(self.rig.chirp)
         self._filters = {sweep.size: object_filter(self.rig, self.board, sweep) for sweep in sweeps}
         self._path = prepare(self.rig, self.board)
@@ -216,9 +216,10 @@ class BoardRows:
 
     @property
     def rx_order(self) -> list[int]:
-        """Place in the rig file of each recorded RX, counted from 1: the order that most rows with another order show.
+        """Place in the rig file of each recorded RX, counted from 1, if it is another order than the rig file's.
 
-        Empty if fewer than `OTHER_ORDER_SHARE` of all rows show it; rows without an echo cannot.
+        It is the most frequent other order; empty if fewer than `OTHER_ORDER_SHARE` of all rows show it. Rows without
+        an echo show none.
         """
         for row, quality in list(self.rows.items()):
             if row not in self._orders:
@@ -265,7 +266,7 @@ class BoardRows:
         return None
 
     def residual(self, stage: str) -> float | None:
-        """Return the phase's standard deviation after a synchronisation stage, median over rows, radians, or None."""
+        """Return the phase's standard deviation after a synchronisation stage, radians: median over rows, or None."""
         residuals = [r.residuals[stage] for r in self.figures.values() if stage in r.residuals]
         phases = [phase_rad for _, phase_rad, _ in residuals]
         if phases:
@@ -471,8 +472,8 @@ class Quality:
         middle_m = specular_midpoint_m(rig, self.boards[name].board)[1]
         y_m = middle_m + np.array([row.y_mm for row in plan_raster(rig.grid)]) / 1e3
         removed_rad = drift.at(y_m)
-        # Difference between two plates, root mean square, of what the images still have; all of it until they are
-        # measured again.
+        # Drift that the images still have: root mean square difference between two plates. All of it, until images
+        # without it are measured.
         remaining_rad = float(np.sqrt(2)) * drift.rms_rad
         for _ in range(MOST_DRIFT_ROUNDS):
             for builder in builders:
@@ -486,7 +487,7 @@ class Quality:
             remaining_rad = float(np.sqrt(2) * np.std(change_rad))
             if np.std(change_rad) < DRIFT_DONE_RAD:
                 break
-            # Half of the change: with all of it the estimates swing about the drift.
+            # Half of the change: with all of it the estimates oscillate about the drift.
             removed_rad = removed_rad + change_rad / 2
         self.drift = RemovedDrift(
             board=name,
@@ -498,7 +499,7 @@ class Quality:
 
     @property
     def lacks_positions(self) -> bool:
-        """True if more positions than a few of some board have no data, and were not reconstructed."""
+        """True if more than a share `SOME_POSITIONS` of a board's positions have no data and were not reconstructed."""
         if self.filled:
             return False
         rows_absent = len(self._list_absent_rows()) / max(1, self.source.plan.rows)

@@ -1,22 +1,26 @@
-"""What the echoes of neighbouring rows show of the phases and places of rows: jumps, displaced rows, and drift.
+"""Find jumps of the phase between rows, displaced rows, and a drift of the phase, from the echoes of the rows alone.
 
-Echoes of neighbouring positions are alike: a linear predictor from the two rows on either side, fitted to the rows
-around, explains an echo but for 15 to 30 % of its amplitude where plates reflect (rows 6 mm apart).
+Echoes of neighbouring positions are alike, so that rows predict each other. The echo of row k at position i is
+
+    e(k, i) = sum over d = -2, -1, 1, 2 and t = -1, 0, 1 of w(d, t) e(k + d, i + t) + residual
+
+with weights w fitted by least squares to the rows around. Where plates reflect, the residual has 15 to 30 % of the
+echo's amplitude (rows 6 mm apart).
 
 A jump of the phase between two rows comes, for example, from a cable that was touched. Referencing to the direct path
-leaves it if only the echo has it. If the phase jumps by phi between two rows, the parts of the prediction from the
-other side of the jump have to be turned by phi; least squares gives it. A jump where nothing reflects (gaps between
-plates, rows at the ends of the scan) is not seen, and one between the last row of one plate and the first of the next
-looks like a difference of the plates.
+does not remove it if only the echo has it. If the phase jumps by phi before row n, the terms of the sum from the other
+side of the jump have to be multiplied by exp(j phi) in rows k >= n, and by exp(-j phi) in rows k < n; least squares
+gives phi. A jump where nothing reflects (gaps between plates, rows at the ends of the scan) is not seen, and one
+between the last row of one plate and the first of the next looks like a difference of the plates.
 
-Rows of the stage that are not where they were commanded change the echoes of both boards by the same shift times the
-slope of each echo from row to row. What the prediction leaves of each row shows this shift; where both boards show the
-same shifts, the rows are displaced, and jumps are looked for in echoes without these shifts.
+A row that is not where the stage was commanded changes the echoes of both boards by the same shift times the slope of
+each echo from row to row. The residual of each row shows this shift; where both boards show the same shifts, the rows
+are displaced, and jumps are searched for in echoes without these shifts.
 
 The phase of one board against the other may also drift over the rows (a cable or a board that warms up). The stage
 moves the whole rig, so the phase of V / H is constant inside a plate unless it drifts. A field over y is fitted to the
-phase of V / H along all plates together (Gaussian process, as in `materials/common_change.py`, which takes drifts of
-some degrees); a drift by far more is removed from the rows.
+phase of V / H along all plates together (Gaussian process). Drifts of some degrees are left to
+`materials/common_change.py`; far larger ones are removed from the rows.
 """
 
 from __future__ import annotations
@@ -35,67 +39,71 @@ from polysight.results import PhaseJump
 # Rows on either side that an echo is predicted from, and positions on either side in each of them; chosen.
 _PREDICTOR_ROWS = (-2, -1, 1, 2)
 _PREDICTOR_POSITIONS = 1
-# Rows on either side of a jump that the predictor is fitted to, and regularisation relative to its mean power; chosen.
+# Rows on either side of a jump that the weights are fitted to; chosen.
 _FIT_ROWS = 6
+# Regularisation of that fit, relative to the mean power of a neighbour; chosen.
 _RIDGE = 1e-3
 # Least jump that is reported; chosen.
 _LEAST_RAD = np.radians(9)
-# Least clearness of a jump: its ratio to the error of the prediction, times how far that ratio stands out from the
-# third largest one (a jump's neighbours have a share of it). Of 136 boards in drawn scenes without a jump, two thirds
-# of them with rows 6 mm apart, which are predicted badly from their neighbours, the clearest reached 1.5. Of jumps of
-# 60 degrees 82 % reach 2, of 30 degrees 65 % (all simulated); with rows 2 mm apart those of 15 degrees reach 11.
+# The ratio of a jump is its angle divided by its error. Least value of ratio^2 / third largest ratio of all rows (a
+# jump's neighbours have a share of it) with which the row of the largest ratio has a jump. Of 136 boards in drawn
+# scenes without a jump, two thirds of them with rows 6 mm apart, which are predicted badly from their neighbours, the
+# largest value is 1.5. Of jumps of 60 degrees 82 % reach 2, of 30 degrees 65 % (all simulated); with rows 2 mm apart
+# those of 15 degrees reach 11.
 _LEAST_CLEAR = 2.0
-# The error of the prediction relative to the part that turns, above which a row is not used; chosen.
+# Amplitude of the residual relative to the terms from the other side of a jump, above which a row is not used; chosen.
 _MAX_ERROR = 1.0
-# Least number of rows that are used: the clearest is compared with the third. Scenes with rows 12 mm apart, where
-# a row is not predicted from its neighbours, have 3 to 5, and jumps of their own; others 8 and more.
+# Least number of rows that are used: the largest ratio is compared with the third. Scenes with rows 12 mm apart, where
+# a row is not predicted from its neighbours, use 3 to 5 rows, and seem to have jumps; others use 8 and more.
 _LEAST_ROWS = 10
-# Times that a jump is measured again with what was found turned back: until then the predictor was fitted across it.
+# Times that a jump is measured again after it was turned back: the weights were fitted to rows on both sides of it.
 _REPEATS = 2
-# Most jumps of a board that are looked for, one after another (a loose cable makes several); chosen.
+# Most jumps of a board that are searched for, one after another (a loose cable makes several); chosen.
 _MOST_JUMPS = 4
-# Rows at either end of a scan, where the predictor is not fitted to both sides; chosen.
+# First rows of a scan, before which no jump is searched for; scans with fewer than twice as many have none. Chosen.
 _END_ROWS = 3
 
 JUMP_LEFT = 0.2
-"""Standard deviation of a plate's phase by a jump of a board's phase that was removed, relative to the jump. Most jumps
+"""Standard deviation of a plate's phase after a jump of a board's phase was removed, relative to the jump. Most jumps
 of 30 degrees are measured within 4 degrees, those at the rim of weak plates within 8 (simulated)."""
-# Least correlation of the shifts that both boards show, their least normal deviate, and their least rms in mm, from
-# which rows are displaced; shifts beyond so many standard deviations are cut. Of ten scenes of another author's
-# generator with rows 0.4 mm off the least correlation is 0.6, of 19 with rows in their places the largest is 0.15.
+# Rows are displaced if the correlation of the shifts that both boards show, the normal deviate of this correlation, and
+# the rms of the shifts are at least these. In ten scenes of another author's generator with rows 0.4 mm off the least
+# correlation is 0.6, in 19 with rows in their places the largest is 0.15.
 _LEAST_CORRELATION = 0.4
 _LEAST_DEVIATE = 3.5
-_CUT_STDS = 3.0
-# Rounds in which shifts are measured and removed, and the largest difference of a jump's size between them; chosen.
-_SHIFT_ROUNDS = 2
-_SAME_RAD = 0.2
 _LEAST_SHIFT_MM = 0.1
-# Rms of a row's shift against the mean of the four rows around it, over that of independent shifts of single rows.
+# Larger shifts are cut to so many standard deviations for the correlation.
+_CUT_STDS = 3.0
+# Rounds in which shifts are measured and removed; chosen.
+_SHIFT_ROUNDS = 2
+# Largest difference of a jump's size between these rounds; chosen.
+_SAME_RAD = 0.2
+# Rms of a row's shift against the mean of the four rows around it, divided by the rms of independent shifts of rows.
 _AGAINST_NEIGHBOURS = 1.39
 
 # Drifts of the phase over y: standard deviations in radians and correlation lengths in metres; chosen.
 _DRIFT_STDS_RAD = (0.15, 0.4, 1.0)
 _DRIFT_LENGTHS_M = (0.05, 0.1, 0.2)
-# Differences between plates without a drift: standard deviation of the phase of V / H by material and leakage, which is
-# the first value plus the second one over the plate's |V / H| relative to the largest of all plates, both times one of
-# `_MATERIAL_SCALES` (weak V has any phase). Then, times one of `_OWN_SCALES`, those of a plate's own slope (radians per
-# metre), of its own unevenness (radians, over `_OWN_LENGTH_M`), and of single rows of pixels. All are chosen.
+# Differences between plates without a drift, all chosen. Standard deviation of a plate's phase by material and leakage:
+# one of `_MATERIAL_SCALES` times (first value + second value / m), with m the plate's |V / H| relative to the largest
+# of all plates: weak V has any phase.
 _MATERIAL_STD_RAD = 0.1
 _MATERIAL_STD_BY_WEAKNESS_RAD = 0.05
 _MATERIAL_SCALES = (1.0, 3.0)
-_OWN_SCALES = (1.0, 3.0, 10.0)
+# Standard deviations of a plate's own slope (radians per metre), of its unevenness over the length that follows, and of
+# single rows of pixels; all times one of `_OWN_SCALES`.
 _OWN_SLOPE_STD = 1.5
 _OWN_STD_RAD = 0.03
 _OWN_LENGTH_M = 0.006
 _ROW_STD_RAD = 0.02
-# Standard deviation of the phase that all plates share, radians: any.
+_OWN_SCALES = (1.0, 3.0, 10.0)
+# Standard deviation of the phase that all plates share, radians: so large that any phase is possible.
 _COMMON_STD_RAD = 10.0
 LEAST_PLATES = 3
 """Plates from which a drift is estimated; chosen."""
-# Least logarithm of the probability of a drift over that of none, and least rms of the drift between the plates, from
-# which it is reported and removed. In scenes of another author's generator with drifts of 30 to 90 degrees the
-# logarithm is 35 and more, in undisturbed ones 4 at most; with tables, edge strips, ripple and a drift of gains
-# together it is 17.
+# A drift is reported and removed if ln(its probability / that of none) and its rms between the plates are at least
+# these. In scenes of another author's generator with drifts of 30 to 90 degrees the logarithm is 35 and more, in
+# undisturbed ones 4 at most; with tables, edge strips, ripple and a drift of gains together it is 17.
 _LEAST_LOG_ODDS = 15.0
 _LEAST_DRIFT_RAD = 0.15
 # Phases to which a drift is fitted at most: a fit to 300 takes half a second.
@@ -110,7 +118,7 @@ def find_phase_jumps(rows: Mapping[int, NDArray[np.complexfloating]]) -> tuple[P
     """Find the clear jumps of the phase from row to row, at most `_MOST_JUMPS`, in the order of rows.
 
     `rows`: number to echoes, complex [rx, position], positions from the smallest x. Numbers that are missing count as
-    rows without echo. What was found is turned back before the next jump is looked for.
+    rows without echo. Each jump is turned back before the next one is searched for.
     """
     if len(rows) < 2 * _END_ROWS:
         return ()
@@ -149,13 +157,13 @@ def _find_clearest_jump(echoes: NDArray[np.complex128]) -> PhaseJump | None:
 
 
 Neighbours = dict[int, list[NDArray[np.complex128]]]
-"""Row to the neighbours of its positions, [rx * position, tap], for each of `_PREDICTOR_ROWS`."""
+"""Row k to its neighbours e(k + d, i + t), [rx * position, tap], for each d of `_PREDICTOR_ROWS`; a tap is one t."""
 Products = dict[int, tuple[NDArray[np.complex128], NDArray[np.complex128]]]
-"""Row to the sums of least squares over it."""
+"""Row k to N^H N and N^H e(k), with N [rx * position, d and tap] its neighbours: sums for least squares."""
 
 
 def _collect_neighbours(echoes: NDArray[np.complex128]) -> tuple[Neighbours, Products]:
-    """Return what rows of echoes [row, rx, position] are predicted from, and sums of least squares, by row."""
+    """Return the neighbours of rows of echoes [row, rx, position], and their sums for least squares, by row."""
     count, rx, positions = echoes.shape
     padded = np.pad(echoes, ((0, 0), (0, 0), (_PREDICTOR_POSITIONS, _PREDICTOR_POSITIONS)))
     taps = 2 * _PREDICTOR_POSITIONS + 1
@@ -165,15 +173,16 @@ def _collect_neighbours(echoes: NDArray[np.complex128]) -> tuple[Neighbours, Pro
     neighbours = {k: [shifted[k + d].reshape(rx * positions, taps) for d in _PREDICTOR_ROWS] for k in targets}
     products = {}
     for k in targets:
-        together = np.concatenate(neighbours[k], axis=1)
-        products[k] = together.conj().T @ together, together.conj().T @ echoes[k].ravel()
+        all_neighbours = np.concatenate(neighbours[k], axis=1)
+        adjoint = all_neighbours.conj().T
+        products[k] = adjoint @ all_neighbours, adjoint @ echoes[k].ravel()
     return neighbours, products
 
 
 def _fit_predictor(
     products: Sequence[tuple[NDArray[np.complex128], NDArray[np.complex128]]],
 ) -> NDArray[np.complex128] | None:
-    """Return the predictor [row and tap] that fits these rows best; None if they have no echo."""
+    """Return the weights [d and tap] that predict these rows best; None if they have no echo."""
     normal = np.sum([product for product, _ in products], axis=0)
     power = float(np.trace(normal).real) / len(normal)
     if power == 0:
@@ -183,7 +192,10 @@ def _fit_predictor(
 
 
 def _measure_jumps(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the jump before each row, radians, and the error of its prediction, [row]; the error is inf if unknown."""
+    """Return the jump before each row, radians, and the error of that, [row]; the error is inf if it is unknown.
+
+    The error is the amplitude of the residual relative to that of the terms from the other side of the jump.
+    """
     count, rx, positions = echoes.shape
     taps = 2 * _PREDICTOR_POSITIONS + 1
     angles = np.zeros(count)
@@ -195,6 +207,7 @@ def _measure_jumps(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64],
         if coefficients is None:
             continue
         predictor = coefficients.reshape(len(_PREDICTOR_ROWS), taps)
+        # `turn` sums |beyond|^2 exp(j phi), with `beyond` the terms of a row from the other side of the jump.
         turn = 0j
         turned_power = 0.0
         residual = 0.0
@@ -209,13 +222,14 @@ def _measure_jumps(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64],
                     beyond += values @ weights
                 else:
                     unpredicted -= values @ weights
-            # Rows before the jump see it turned one way, rows behind it the other way.
+            # unpredicted = exp(-j phi) beyond in rows before the jump, exp(j phi) beyond in rows after it.
             product = np.vdot(beyond, unpredicted)
             turn += product.conjugate() if k < jump else product
             turned_power += float(np.vdot(beyond, beyond).real)
             residual += float(np.vdot(unpredicted - beyond, unpredicted - beyond).real)
         if turned_power > 0:
             angles[jump] = float(np.angle(turn))
+            # sum |unpredicted - exp(+-j phi) beyond|^2 = sum |unpredicted - beyond|^2 - 2 (|turn| - Re turn)
             left = max(residual - 2 * (abs(turn) - turn.real), 0.0)
             errors[jump] = max(float(np.sqrt(left / turned_power)), 1e-6)
     return angles, errors
@@ -228,8 +242,8 @@ class DisplacedRows:
     Attributes
     ----------
     shifts
-        float64 [round, row]: shift of each row against its neighbours, in row spacings, measured in echoes without
-        those of the rounds before; the row's number counts from 0. No rounds if no rows are displaced.
+        float64 [round, row]: shift of each row against its neighbours, in row spacings, measured after the shifts of
+        the rounds before were removed. No rounds if no rows are displaced.
     rms_mm
         Root mean square of the rows' independent shifts; 0 if no rows are displaced.
     """
@@ -277,7 +291,7 @@ def find_displaced_rows(boards: Sequence[Mapping[int, NDArray[np.complexfloating
 def keep_jumps_without_shifts(
     jumps: Sequence[PhaseJump], rows: Mapping[int, NDArray[np.complexfloating]], shifts: NDArray[np.float64]
 ) -> tuple[PhaseJump, ...]:
-    """Return the jumps that the echoes show as recorded and, at the same row and alike, after each round of shifts.
+    """Return those of the `jumps` that the echoes still show, at the same row and as large, after each round of shifts.
 
     A row that is displaced looks like a jump, and so may one whose shift was measured wrongly.
     """
@@ -325,9 +339,10 @@ def _slope_over_rows(echoes: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 def _measure_shifts(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the shift of each row against its neighbours, in row spacings, and its variance but for a constant, [row].
+    """Return the shift of each row against its neighbours, in row spacings, and its variance but for a factor, [row].
 
-    The variance is inf where a row without echo is involved.
+    The shift is the least-squares factor of the slope in the residual of the prediction. The variance is inf where a
+    row without echo is involved.
     """
     count = len(echoes)
     slopes = _slope_over_rows(echoes)
@@ -392,8 +407,8 @@ class _DriftField:
     y_m, centres_m
         [value]: y of the measured phases. [plate]: y of the middle of each plate's rows.
     cases
-        Weight, standard deviation and length of the drift (radians, metres) of each case, and the covariance of the
-        measured phases [value, value] as well as its solution for them [value].
+        Of each case: weight; standard deviation (radians) and correlation length (metres) of the drift; covariance S of
+        the measured phases s, [value, value]; and S^-1 s, [value].
     """
 
     y_m: NDArray[np.float64]
@@ -406,7 +421,7 @@ class _DriftField:
         return np.sum(parts, axis=0)
 
     def covariance(self, y_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the covariance of the drift's errors at y."""
+        """Return the covariance of the drift's errors at y: its mean over the cases plus that of the cases' means."""
         mean = self.mean(y_m)
         total = np.zeros((y_m.size, y_m.size))
         for weight, std, length, measured, answer in self.cases:
@@ -446,18 +461,23 @@ def estimate_phase_drift(
     drift = field.mean(centres_m)
     away = np.eye(centres_m.size) - 1 / centres_m.size
     error = away @ field.covariance(centres_m) @ away.T
+    steps_of_v = sum(plate.step_v_rad**2 for plate in plates)
+    steps_of_h = sum(plate.step_h_rad**2 for plate in plates)
     return PhaseDrift(
         log_odds=log_odds,
         rms_rad=float(np.std(drift)),
         range_rad=float(np.ptp(drift)),
         left_rad=float(np.sqrt(2 * max(np.mean(np.diag(error)), 0.0))),
-        of_v=sum(plate.step_v_rad**2 for plate in plates) > sum(plate.step_h_rad**2 for plate in plates),
+        of_v=steps_of_v > steps_of_h,
         field=field,
     )
 
 
 def _join_turns(phases: Sequence[NDArray[np.float64]], centres_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return all phases in one array, each plate's by whole turns nearest to that of the plates before it along y."""
+    """Return all phases in one array, with each plate moved by whole turns as near as possible to those below it.
+
+    "Below" is along y: the mean of the last `LEAST_PLATES` plates counts. The mean of all phases is subtracted.
+    """
     joined: dict[int, NDArray[np.float64]] = {}
     level = 0.0
     for number in np.argsort(centres_m, kind="stable").tolist():

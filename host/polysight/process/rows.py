@@ -1,11 +1,12 @@
-"""From rows to images: several rows at a time, restored from kept samples where that is possible.
+"""Process the rows of a scan into images, several rows at a time, or restore them from kept samples.
 
 `map_rows` and `map_boards` process rows, or the boards of a row, on several threads: the compiled synchronisation
 releases the interpreter.
 
-Kept samples are the reduced samples of a scan on disk, from which images are formed without raw data. `KeptSamples`
-belongs to one pipeline. It restores a row from disk if the row was made from the same raw bytes with the same settings;
-otherwise the pipeline synchronises the row and saves it. Missing, truncated or damaged records are synchronised again.
+*Kept samples* are the rows of a scan after synchronisation, reduced to the range gate (the excess paths of the scene)
+and stored on disk: images are formed from them without raw data. `KeptSamples` belongs to one pipeline. It restores a
+row from disk if the row was made from the same raw bytes with the same settings; otherwise the pipeline synchronises
+the row and saves it. Rows with missing, truncated or damaged records are synchronised again.
 File format: docs/spec/samples.md.
 """
 
@@ -76,7 +77,8 @@ Gate = tuple[float, float]
 Result = TypeVar("Result")
 
 MAX_ROWS = 8
-"""Rows in flight: each takes some 60 MB on the published grid, and memory bandwidth limits more threads."""
+"""Rows that are processed at the same time: each takes some 60 MB on the published grid, and more threads would be
+limited by the memory's bandwidth."""
 _log = logging.getLogger(__name__)
 
 

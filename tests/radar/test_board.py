@@ -27,6 +27,16 @@ from polysight_simulators.radars import Fault, board as simulated, cores, make_i
 FRAMES = 32
 # Period of the published rig's pulses.
 PERIOD_S = 1.5e-3
+# Numbers of messages and events
+DATA_FORMAT = 0x0082
+PROFILE = 0x0100
+FRAME = 0x0102
+FRAME_APPLY = 0x40C0
+READY_FOR_TRIGGERS = 0x100B
+REPORT_OF_CALIBRATION = 0x1012
+POWER_UP = 0x5000
+# Error number with which a board refuses a command
+REFUSED = 6
 
 
 @pytest.fixture
@@ -79,24 +89,28 @@ def test_every_message_of_bring_up_and_arming_is_sent_once_in_order(radar, board
     expected = [0x404C, 0x4000, 0x0220, 0x40E0, 0x0080, 0x0082, 0x02CC, 0x4041, 0x0083, 0x008D, 0x0086, 0x00C0]
     expected += [0x0100, 0x0101, 0x4042, 0x4044, 0x0085, 0x4043, 0x4045, 0x0223, 0x02EA, 0x0102, 0x40C0, 0x0140]
     assert board.executed == expected
-    (start_code,) = struct.unpack_from("<I", board.settings[0x0100], 4)
-    (slope_code,) = struct.unpack_from("<h", board.settings[0x0100], 28)
+    (start_code,) = struct.unpack_from("<I", board.settings[PROFILE], 4)
+    (slope_code,) = struct.unpack_from("<h", board.settings[PROFILE], 28)
     assert (start_code, slope_code) == (1416929098, 804)
-    assert struct.unpack_from("<H", board.settings[0x0102], 8)[0] == FRAMES
+    (frames,) = struct.unpack_from("<H", board.settings[FRAME], 8)
+    assert frames == FRAMES
 
 
 def test_only_the_transmitter_transmits(rig):
-    for position in rig.boards:
-        messages = make_program(rig, position)
+    for board in rig.boards:
+        program = make_program(rig, board)
         # Two messages have a bit for each of the three transmitters: the second one is used, and only by one board.
-        masks = [c.tx for c in (*messages.basic, *messages.waveform) if hasattr(c, "tx")]
-        assert masks == ([0b010] * 2 if position.role == "transmit" else [0, 0])
+        masks = [command.tx for command in (*program.basic, *program.waveform) if hasattr(command, "tx")]
+        if board.role == "transmit":
+            assert masks == [0b010, 0b010]
+        else:
+            assert masks == [0, 0]
 
 
 def test_a_board_is_armed_only_after_the_radar_reported_it(radar, monkeypatch):
     """Event 0x100B: ready for triggers."""
     radar.configure()
-    # The simulated board needs that many seconds to become ready.
+    # The simulated board never becomes ready.
     monkeypatch.setattr(cores, "READY_S", 1e9)
     with expect_refusal(ErrorCode.NO_ANSWER, "0x100B"):
         radar.arm(FRAMES)
@@ -122,11 +136,11 @@ def test_remaining_frames_are_stopped_before_arming_again(radar, board, clock):
 
 
 def test_a_stop_is_never_sent_during_a_frame(radar, board, clock):
+    """Arming stops waiting frames. The radar is armed immediately after a pulse, within its frame, and after it."""
     radar.arm(FRAMES)
-    """Arming stops waiting frames; it is asked for at five moments of a frame, which lasts 0.23 ms, and after it."""
-    for n in range(5):
+    for after_pulse_s in (0.0, 3e-4, 6e-4, 9e-4, 12e-4):
         board.trigger()
-        clock.sleep(n * 3e-4)
+        clock.sleep(after_pulse_s)
         radar.arm(FRAMES)
         assert radar.state is State.ARMED
 
@@ -143,7 +157,8 @@ def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, cloc
 @pytest.mark.parametrize(
     ("number", "data", "reason"),
     [
-        # Faults of a core: code, code of an error, line of the firmware. Groups of error signals. Faults of the supply.
+        # Data of faults of a core: code, code of an error, line of the firmware. The others are groups of error signals
+        # and faults of the supply.
         (RF_CPU_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), "not triggered by a pulse, firmware line 4711"),
         (RF_CPU_FAULT, struct.pack("<BBH", 2, 0, 0) + bytes(28), "data access abort"),
         (RF_ESM_FAULT, struct.pack("<II", 0, 1), "group 2 0x00000001"),
@@ -168,10 +183,11 @@ def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, r
 @pytest.mark.parametrize(
     ("number", "data"),
     [
-        # Kinds of these events that are not fatal, a report of a calibration, and an unknown event.
+        # Kinds of these events that are not fatal
         (RF_ESM_FAULT, struct.pack("<II", 1, 0)),
         (RF_ERROR, struct.pack("<II", 7, 0)),
-        (0x1012, bytes(20)),
+        (REPORT_OF_CALIBRATION, bytes(20)),
+        # An unknown event
         (0x1234, b""),
     ],
 )
@@ -236,11 +252,12 @@ def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
     import msgspec
 
     burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=5000.0)
-    many = msgspec.structs.replace(rig, burst=burst)
-    radar = RadarBoard("LS", words, clock, make_program(many, many.by_name("LS")))
+    rig_of_many_chirps = msgspec.structs.replace(rig, burst=burst)
+    program = make_program(rig_of_many_chirps, rig_of_many_chirps.by_name("LS"))
+    radar = RadarBoard("LS", words, clock, program)
     radar.arm(FRAMES)
-    loops, frames = struct.unpack_from("<2H", board.settings[0x0102], 6)
-    chirps = struct.unpack_from("<I", board.settings[0x40C0])[0]
+    loops, frames = struct.unpack_from("<2H", board.settings[FRAME], 6)
+    (chirps,) = struct.unpack_from("<I", board.settings[FRAME_APPLY])
     assert (loops, frames, chirps) == (16, FRAMES, 16)
     send_pulses(board, clock, FRAMES, 5e-3)
     assert radar.poll() is State.DONE
@@ -269,8 +286,8 @@ def test_a_board_that_restarts_by_itself_is_a_fault_and_recovers(radar, board, c
 IMAGE = check_image(make_image(), "image.bin")
 
 
-# Commands of a bring-up and an arming: 25 with firmware in the flash, and 60 with those that load it into the RAM, of
-# which every seventh is tried.
+# A bring-up and an arming have 25 commands with firmware in the flash. Without it 35 more load the firmware into the
+# RAM; of these 60 every seventh is tried.
 @pytest.mark.parametrize(("flash", "commands", "step"), [(make_image(), 25, 1), (b"", 60, 7)], ids=["flash", "RAM"])
 def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, commands, step):
     """The restart replaces each answer of a bring-up and an arming: it is the cause, not the rig file or the image."""
@@ -281,15 +298,16 @@ def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, command
         begun_s = clock.time
         with expect_refusal(ErrorCode.RADAR_RESTARTED, "RH"):
             radar.arm(FRAMES)
-        # The longest timeout of a message is not waited for several times (virtual time, chosen).
+        # In virtual time; up to 0.7 s are measured.
         assert clock.time - begun_s < 8.0, command_of_restart
         assert radar.state is State.FAULT
         radar.arm(FRAMES)
         assert radar.state is State.ARMED
-    # The number of commands is the right one: without a restart so many are sent.
-    words = Restarts(simulated.RadarBoard(lambda: clock.time, flash=flash), clock, 1000)
+    # `commands` is the number of commands that are sent without a restart.
+    beyond_the_last = 1000
+    words = Restarts(simulated.RadarBoard(lambda: clock.time, flash=flash), clock, beyond_the_last)
     RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), IMAGE).arm(FRAMES)
-    assert 1000 - words.left == commands
+    assert beyond_the_last - words.left == commands
 
 
 def test_a_refusal_just_after_a_restart_is_reported_as_a_restart(radar, board, monkeypatch):
@@ -297,9 +315,11 @@ def test_a_refusal_just_after_a_restart_is_reported_as_a_restart(radar, board, m
     execute = board.cores.execute
 
     def restart_at_data_format(number, data, remaining):
-        if number == 0x0082:
-            board.cores.event(0x5000, struct.pack("<IQQ", 371_216, 0, 0), 0.03)
-            return 6, b"", 0.0
+        if number == DATA_FORMAT:
+            board.cores.event(POWER_UP, struct.pack("<IQQ", 371_216, 0, 0), 0.03)
+            no_data = b""
+            no_delay_s = 0.0
+            return REFUSED, no_data, no_delay_s
         return execute(number, data, remaining)
 
     monkeypatch.setattr(board.cores, "execute", restart_at_data_format)
@@ -308,13 +328,13 @@ def test_a_refusal_just_after_a_restart_is_reported_as_a_restart(radar, board, m
 
 
 def test_frames_that_end_right_after_arming_are_an_error(radar, board, monkeypatch):
-    """The board reports 0x100F, the end of the frames, together with 0x100B, ready for triggers."""
+    """The board reports the end of the frames together with its being ready for triggers."""
     event = board.cores.event
 
     def send_with_end(number, data, delay_s):
         event(number, data, delay_s)
-        if number == 0x100B:
-            event(0x100F, b"", delay_s)
+        if number == READY_FOR_TRIGGERS:
+            event(FRAME_END, b"", delay_s)
 
     monkeypatch.setattr(board.cores, "event", send_with_end)
     with expect_refusal(ErrorCode.OTHER, "LS"):
@@ -336,24 +356,26 @@ def test_a_cable_unplugged_before_the_power_up_event_is_not_reported_as_wrong_ju
     ("faults", "code"),
     [([Fault.REFUSE], ErrorCode.REFUSED_BY_PEER), ([Fault.NO_ANSWER] * 3, ErrorCode.NO_ANSWER)],
 )
-def test_an_ignored_fault_is_named_after_the_cause_of_a_failure(radar, board, faults, code):
-    """The fault that boards report at their start is not the cause, but may help: it is not first in the text."""
+def test_the_text_of_a_failure_names_the_cause_before_a_fault_that_was_ignored(radar, board, faults, code):
+    """The fault that boards report at their start is not the cause, but may help."""
     board.inject(*faults)
     with expect_refusal(code) as caught:
         radar.configure()
+    # The cause is a sentence: it has 88 characters here.
     assert caught.value.why.index("main core fault: register read-back error") > 20
 
 
 def test_events_without_end_delay_a_poll_only_briefly(radar, board, clock):
     radar.arm(FRAMES)
     for _ in range(5000):
-        board.send_event(0x1012, bytes(20))
+        board.send_event(REPORT_OF_CALIBRATION, bytes(20))
     begun_s = clock.time
     assert radar.poll() is State.ARMED
-    # Virtual time; the limit is chosen.
+    # In virtual time; 0.07 s is measured.
     assert clock.time - begun_s < 0.5
     assert any("without a pause" in line for line in radar.warnings)
     for _ in range(200):
         radar.poll()
+    # The report has a thousand events at most.
     assert len(radar.report()["events"]) <= 1000
     assert radar.poll() is State.ARMED

@@ -1,4 +1,4 @@
-"""Saving and restoring the calibration of a board; reading back settings."""
+"""The calibration of a radar board is saved, and restored at its next start; its settings are read back."""
 
 import json
 import struct
@@ -33,7 +33,7 @@ def test_settings_are_read_back_and_a_difference_is_reported(make_board, board):
     radar.configure()
     radar.arm(FRAMES)
     assert radar.read_back() == []
-    # One byte of the profile is another one in the board.
+    # In the board one byte of the profile is different.
     board.cores.profiles[0] = board.cores.profiles[0][:4] + b"\0" + board.cores.profiles[0][5:]
     (difference,) = radar.read_back()
     assert difference.startswith("0x0100: sent ")
@@ -52,7 +52,7 @@ def test_a_calibration_is_saved_and_restored_at_the_next_start(make_board, board
     assert restored_board.facts.calibration_restored is True
     # The saved calibration has three parts.
     assert board.executed.count(RestoreCalibration.ID) == 3
-    # The board makes the other calibrations by itself, and not the restored ones.
+    # The board makes the other calibrations, and not the restored ones.
     (mask,) = struct.unpack_from("<I", board.settings[InitCalibrations.ID])
     assert mask & RESTORED_CALIBRATIONS == 0
     assert mask | RESTORED_CALIBRATIONS == ALL_CALIBRATIONS
@@ -79,7 +79,7 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     with expect_refusal(ErrorCode.RADAR_FAULT, text):
         radar.configure()
     assert not (tmp_path / "kept").exists()
-    # No profile was sent after it.
+    # No profile (message 0x0100) was sent afterwards.
     assert 0x0100 not in board.executed
 
 
@@ -97,9 +97,14 @@ def test_other_settings_and_other_dies_have_their_own_calibration(make_board, bo
     assert len(list(tmp_path.iterdir())) == 3
 
 
-# A file that was cut, one whose checksum is another one, and one that is no table.
 @pytest.mark.parametrize(
-    "spoil", [lambda t: t[: len(t) // 2], lambda t: t.replace('"crc32": ', '"crc32": 1'), lambda t: t[:0] + "[]"]
+    "spoil",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: text.replace('"crc32": ', '"crc32": 1'),
+        lambda _: "[]",
+    ],
+    ids=["half of the file", "another checksum", "not a table"],
 )
 def test_a_damaged_calibration_is_not_sent_to_a_board(make_board, board, tmp_path, spoil):
     files = CalibrationFiles(tmp_path, b"settings")

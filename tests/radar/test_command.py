@@ -3,7 +3,6 @@
 import json
 import os
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -20,6 +19,17 @@ from polysight_shared.tables import to_builtins
 from polysight_simulators.radars import RadarBoard, make_image
 from polysight_simulators.radars.__main__ import replay
 from polysight_simulators.radars.cores import BOOT_S, FAULT_DATA
+
+# Exit statuses of `polysight`
+SUCCESS = 0
+NOT_PASSED = 1
+REFUSED = 2
+UNUSABLE_FILE = 3
+INTERRUPTED = 130
+
+# First bytes of each message of the host, and of each message of a board
+HOST_SYNC = "34122143"
+BOARD_SYNC = "badccdab"
 
 # Steps of `polysight radar check`, in order.
 STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
@@ -38,7 +48,7 @@ def rig_file(rig, tmp_path):
 
 @pytest.fixture
 def opened_boards(words, clock, monkeypatch):
-    """Connect the command to the simulated board `RH`, in virtual time; places and speeds of opened boards."""
+    """The address of each board that the command has opened, and whether slowly: always the simulated board `RH`."""
     places = []
 
     def open_board(place, slow):
@@ -55,20 +65,22 @@ def run(path, *args: str) -> int:
 
 
 def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
-    assert run(rig_file(), "plan") == 0
+    assert run(rig_file(), "plan") == SUCCESS
     out = capsys.readouterr().out
     assert "BROKEN" not in out
-    # 34122143: the sync word of the host's messages.
-    sent = [decode(bytes.fromhex(line.split()[-1])).blocks for line in out.splitlines() if "34122143" in line]
+    lines_of_messages = [line for line in out.splitlines() if HOST_SYNC in line]
+    sent = [decode(bytes.fromhex(line.split()[-1])).blocks for line in lines_of_messages]
     expected = []
     for board in rig.boards:
         messages = make_program(rig, board)
-        expected += [(c.block(),) for c in (*messages.basic, *messages.waveform, *messages.make_frame_commands(5600))]
+        # A row of the published rig: 350 positions of 16 pulses
+        commands = (*messages.basic, *messages.waveform, *messages.make_frame_commands(350 * 16))
+        expected += [(command.block(),) for command in commands]
     assert sent == expected
 
 
 def test_a_sound_board_passes_every_step(rig_file, opened_boards, capsys):
-    assert run(rig_file(), "check", "RH", "--json", "--slow") == 0
+    assert run(rig_file(), "check", "RH", "--json", "--slow") == SUCCESS
     result = json.loads(capsys.readouterr().out)
     assert [s["step"] for s in result["steps"]] == STEPS
     assert all(s["holds"] for s in result["steps"])
@@ -90,7 +102,7 @@ def test_a_sound_board_passes_every_step(rig_file, opened_boards, capsys):
 @pytest.mark.usefixtures("opened_boards")
 def test_a_failed_step_is_reported_with_what_was_expected_and_a_remedy(rig_file, board, capsys, spoil, step, text):
     spoil(board)
-    assert run(rig_file(), "check", "RH") == 1
+    assert run(rig_file(), "check", "RH") == NOT_PASSED
     out = capsys.readouterr().out
     failed = [line for line in out.splitlines() if "FAILED" in line]
     assert len(failed) == 1
@@ -114,11 +126,11 @@ def test_a_plan_with_a_broken_constraint_fails_without_opening_a_board(
 ):
     part = msgspec.structs.replace(getattr(rig, table), **{key: value})
     path = rig_file(msgspec.structs.replace(rig, **{table: part}))
-    assert run(path, "plan") == 1
+    assert run(path, "plan") == NOT_PASSED
     out = capsys.readouterr().out
     assert "BROKEN" in out
-    assert "34122143" not in out
-    assert run(path, "check", "RH") == 2
+    assert HOST_SYNC not in out
+    assert run(path, "check", "RH") == REFUSED
     assert "the radars would refuse" in capsys.readouterr().err
     assert opened_boards == []
 
@@ -128,10 +140,10 @@ def test_firmware_goes_to_ram_and_to_the_flash_only_with_the_option_flash(rig_fi
     board.cores.flash = b""
     image = tmp_path / "image.bin"
     image.write_bytes(make_image())
-    assert run(rig_file(), "firmware", "RH", str(image)) == 0
+    assert run(rig_file(), "firmware", "RH", str(image)) == SUCCESS
     assert "not written" in capsys.readouterr().out
     assert board.cores.flash == b""
-    assert run(rig_file(), "firmware", "RH", str(image), "--flash") == 0
+    assert run(rig_file(), "firmware", "RH", str(image), "--flash") == SUCCESS
     assert "patch 2.2.2.0 from flash" in capsys.readouterr().out
     assert board.cores.flash == make_image()
     assert words.closed
@@ -141,35 +153,35 @@ def test_a_file_that_is_not_an_image_is_refused_without_opening_a_board(rig_file
     image = tmp_path / "notes.txt"
     image.write_text("not firmware")
     for options in ((), ("--flash",)):
-        assert run(rig_file(), "firmware", "RH", str(image), *options) == 2
+        assert run(rig_file(), "firmware", "RH", str(image), *options) == REFUSED
         assert "is not firmware" in capsys.readouterr().err
     assert opened_boards == []
 
 
 def test_an_unknown_board_is_refused(rig_file, capsys):
-    assert run(rig_file(), "check", "XX") == 2
+    assert run(rig_file(), "check", "XX") == REFUSED
     assert "no board 'XX'" in capsys.readouterr().err
 
 
 def test_a_rig_without_native_boards_is_refused(rig, rig_file, capsys):
     path = rig_file(msgspec.structs.replace(rig, radar=type(rig.radar)()))
     for description in (("plan",), ("check", "RH")):
-        assert run(path, *description) == 2
+        assert run(path, *description) == REFUSED
         assert "usb_serial" in capsys.readouterr().err
 
 
 # Changes of a board: none, firmware that is missing, and wrong jumpers.
-SPOILT = [
+CHANGES = [
     lambda board: setattr(board, "plugged", True),
     lambda board: setattr(board.cores, "flash", b""),
     lambda board: setattr(board, "functional_jumpers", False),
 ]
 
 
-@pytest.mark.parametrize("spoil", SPOILT, ids=["sound", "flash empty", "jumpers"])
+@pytest.mark.parametrize("change", CHANGES, ids=["sound", "flash empty", "jumpers"])
 @pytest.mark.usefixtures("opened_boards")
-def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path, spoil):
-    spoil(board)
+def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path, change):
+    change(board)
     trace = str(tmp_path / "day.jsonl")
     status = run(rig_file(), "check", "RH", "--trace", trace)
     result = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
@@ -201,16 +213,16 @@ def test_an_event_at_any_time_after_power_up_replays(
     words.interrupt = read_line_slowly
     board.cores.boot = boot_with_event
     trace = str(tmp_path / "day.jsonl")
-    assert run(rig_file(), "check", "RH", "--trace", trace) == 0
+    assert run(rig_file(), "check", "RH", "--trace", trace) == SUCCESS
     result = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
-    assert run(rig_file(), "replay", trace) == 0
+    assert run(rig_file(), "replay", trace) == SUCCESS
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")] == result
 
 
 @pytest.mark.usefixtures("opened_boards")
 def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
-    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == SUCCESS
     lines = [json.loads(line) for line in trace.read_text().splitlines()]
     assert (lines[0]["trace"], lines[0]["board"], lines[0]["place"]) == (1, "RH", "FTRH")
     # NRST, the reset, is low while it is held. HOST_INTR is high while the board has a message.
@@ -220,8 +232,9 @@ def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_pa
     assert levels == [n % 2 for n in range(len(levels))]
     # Each rise of the line is one message, which begins with the device's sync word.
     text = "".join(r.get("in", "") for r in lines)
-    assert text.count("badccdab") == levels.count(1)
-    assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))
+    assert text.count(BOARD_SYNC) == levels.count(1)
+    times = [line["t"] for line in lines[1:]]
+    assert times == sorted(times)
 
 
 @pytest.mark.parametrize("act", [lambda words: words.read(3), lambda words: words.write([5])], ids=["read", "write"])
@@ -236,9 +249,9 @@ def test_a_replay_names_the_line_that_differs(tmp_path, act):
 @pytest.mark.usefixtures("opened_boards")
 def test_a_replay_with_another_rig_file_reports_the_first_different_line(rig, rig_file, capsys, tmp_path):
     trace = str(tmp_path / "day.jsonl")
-    assert run(rig_file(), "check", "RH", "--trace", trace) == 0
+    assert run(rig_file(), "check", "RH", "--trace", trace) == SUCCESS
     path = rig_file(change_radar_table(rig, rx_gain_db=40))
-    assert run(path, "replay", trace) == 1
+    assert run(path, "replay", trace) == NOT_PASSED
     assert re.search(r"line \d+ of the trace", capsys.readouterr().out)
 
 
@@ -247,27 +260,31 @@ def test_a_replay_with_another_rig_file_reports_the_first_different_line(rig, ri
 )
 def test_a_file_that_is_not_a_trace_is_refused(rig_file, capsys, tmp_path, text):
     (tmp_path / "a").write_text(text)
-    assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
+    assert run(rig_file(), "replay", str(tmp_path / "a")) == REFUSED
     assert "--trace FILE" in capsys.readouterr().err
 
 
 HEAD = '{"trace": 1, "board": "RH"}\n'
-# Too deep; times that are negative, infinite, too large or missing; values of the wrong type; and times that run
-# backwards.
-BAD_LINES = ["[" * 100_000, '{"t": -5, "out": ""}', '{"t": Infinity, "out": ""}', '{"t": 1e9, "out": ""}', '{"t": 1}']
-BAD_LINES += [
-    '{"t": 1, "line": "HOST_INTR"}',
-    '{"t": 1, "in": "xyz0"}',
-    '{"t": 1, "out": 5}',
-    '{"t": ' + "9" * 400 + ', "out": ""}',
-]
-BAD_LINES += ["5", '{"t": 2, "out": ""}\n{"t": 1, "out": ""}', '{"t": true, "out": ""}']
+BAD_LINES = {
+    "nested too deeply": "[" * 100_000,
+    "not a table": "5",
+    "negative time": '{"t": -5, "out": ""}',
+    "infinite time": '{"t": Infinity, "out": ""}',
+    "time too large": '{"t": 1e9, "out": ""}',
+    "time of 400 digits": '{"t": ' + "9" * 400 + ', "out": ""}',
+    "time of another type": '{"t": true, "out": ""}',
+    "time before that of the line above": '{"t": 2, "out": ""}\n{"t": 1, "out": ""}',
+    "nothing but a time": '{"t": 1}',
+    "a line without its level": '{"t": 1, "line": "HOST_INTR"}',
+    "not hexadecimal": '{"t": 1, "in": "xyz0"}',
+    "bytes of another type": '{"t": 1, "out": 5}',
+}
 
 
-@pytest.mark.parametrize("line", BAD_LINES, ids=range(len(BAD_LINES)))
+@pytest.mark.parametrize("line", BAD_LINES.values(), ids=BAD_LINES.keys())
 def test_an_invalid_line_of_a_trace_is_refused_by_its_number(rig_file, capsys, tmp_path, line):
     (tmp_path / "a").write_text(HEAD + line + "\n")
-    assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
+    assert run(rig_file(), "replay", str(tmp_path / "a")) == REFUSED
     assert re.search(r"a: line [23]", capsys.readouterr().err)
 
 
@@ -284,12 +301,12 @@ def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, 
         with path.open("wb") as file:
             file.truncate(3 * 2**30)
     text = "bytes" if kind == "sparse" else "not a regular file"
-    with_it = change_radar_table(rig, firmware=str(path))
     rig_path = rig_file()
-    for file, args in ((rig_path, ("firmware", "RH", str(path))), (rig_path, ("replay", str(path)))):
-        assert run(file, *args) == 3
+    for arguments in (("firmware", "RH", str(path)), ("replay", str(path))):
+        assert run(rig_path, *arguments) == UNUSABLE_FILE
         assert text in capsys.readouterr().err
-    assert run(rig_file(with_it), "check", "RH") == 3
+    rig_with_firmware = change_radar_table(rig, firmware=str(path))
+    assert run(rig_file(rig_with_firmware), "check", "RH") == UNUSABLE_FILE
     assert text in capsys.readouterr().err
     assert opened_boards == []
 
@@ -297,7 +314,7 @@ def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, 
 def test_an_existing_trace_is_not_overwritten(rig_file, opened_boards, capsys, tmp_path):
     trace = tmp_path / "day.jsonl"
     trace.write_text("of another day")
-    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 2
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == REFUSED
     assert "exists already" in capsys.readouterr().err
     assert trace.read_text() == "of another day"
     assert opened_boards == []
@@ -311,14 +328,16 @@ def test_an_interrupted_flash_write_reports_the_parts_written(rig_file, words, b
     calls = []
 
     def stop_at_part_7(sent):
-        # A command begins with this word of its sync word. The first command is the question for the version.
-        calls.extend(w for w in sent[:1] if w == 0x1234)
-        if len(calls) == 8:
+        # The first word of a command's sync word
+        if sent[0] == 0x1234:
+            calls.append(sent)
+        # The first command is the question for the version.
+        if len(calls) == 1 + 7:
             raise KeyboardInterrupt
         write(sent)
 
     words.write = stop_at_part_7
-    assert run(rig_file(), "firmware", "RH", str(image), "--flash") == 130
+    assert run(rig_file(), "firmware", "RH", str(image), "--flash") == INTERRUPTED
     assert "6 of 35 parts" in capsys.readouterr().err
     assert board.cores.flash != make_image()
 
@@ -326,19 +345,19 @@ def test_an_interrupted_flash_write_reports_the_parts_written(rig_file, words, b
 @pytest.mark.usefixtures("opened_boards")
 def test_a_truncated_trace_replays_to_its_end(rig_file, capsys, tmp_path):
     trace = tmp_path / "day.jsonl"
-    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == SUCCESS
     data = trace.read_bytes()
     for size in range(200, len(data), len(data) // 15):
         (tmp_path / "cut").write_bytes(data[:size])
         capsys.readouterr()
-        assert run(rig_file(), "replay", str(tmp_path / "cut")) == 1
+        assert run(rig_file(), "replay", str(tmp_path / "cut")) == NOT_PASSED
         assert "the trace ends here" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("opened_boards")
 def test_a_trace_is_replayed_to_a_simulated_board(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
-    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == SUCCESS
     differences_of_equal_board = replay(trace, lambda now: RadarBoard(now, flash=make_image()))
     assert differences_of_equal_board == []
     differences_of_board_without_firmware = replay(trace, RadarBoard)

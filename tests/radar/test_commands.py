@@ -166,24 +166,26 @@ def test_parts_of_an_image_are_those_of_the_reference_encoder():
 def test_a_frequency_or_slope_gets_the_nearest_code(start: int, slope: int):
     assert c.start_code(start * c.START_HZ_PER_CODE) == start
     assert c.slope_code(slope * c.SLOPE_HZ_PER_S_PER_CODE) == slope
+    # Nearly half a code more
     assert c.start_code((start + 0.49) * c.START_HZ_PER_CODE) == start
 
 
 # Periods from 300 us to the largest that fits into 28 bits of 5 ns.
 @given(st.integers(0, 65535), st.floats(300.0, 1.342e6), st.integers(1, 255))
 def test_frames_can_be_decoded_from_their_bytes(frames: int, period_us: float, loops: int):
-    data = c.Frame(frames, period_us, 256, loops).data()
+    data = c.Frame(frames=frames, period_us=period_us, samples=256, loops=loops).data()
     assert len(data) == 24
     _, _, _, decoded_loops, decoded_frames, _, period_ticks, trigger, _, _ = struct.unpack("<6HIHHI", data)
     assert (decoded_loops, decoded_frames) == (loops, frames)
-    # 2: frames are started by the hardware trigger.
-    assert trigger == 2
-    # Ticks of 5 ns, rounded to the nearest.
-    assert period_ticks * 0.005 == pytest.approx(period_us, abs=0.0026)
+    hardware_trigger = 2
+    assert trigger == hardware_trigger
+    # The period is rounded to the nearest tick: half a tick, and a little for the rounding of floats.
+    tick_us = 0.005
+    assert period_ticks * tick_us == pytest.approx(period_us, abs=0.52 * tick_us)
 
 
 def test_a_value_that_exceeds_its_field_is_refused():
     with pytest.raises(ValueError, match="Frame"):
-        c.Frame(70_000, 1300.0, 256).block()
+        c.Frame(frames=70_000, period_us=1300.0, samples=256).block()
     with pytest.raises(ValueError, match="Chirp"):
         c.Chirp(tx=-1).block()

@@ -1,4 +1,4 @@
-"""Firmware downloads cannot brick a board: checked before, verified after, recoverable when interrupted anywhere."""
+"""Firmware is checked before its download and verified after it; a download can be repeated after any interruption."""
 
 import zlib
 
@@ -14,6 +14,9 @@ from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 RIG = make_native_rig()
+# Numbers of messages
+FIRMWARE_PART = 0x4080
+RF_POWER_UP = 0x4000
 # An image of firmware in TI's format, 7940 bytes (docs/spec/mmwavelink.md), and one for the ROM of an AWR1243.
 DATA = make_image()
 IMAGE = check_image(DATA, "image.bin")
@@ -77,7 +80,8 @@ def test_the_parts_of_an_image_are_the_whole_image(size):
     parts = split_into_chunks(image)
     joined = b"".join(chunk.part for chunk, _ in parts)
     assert joined == bytes((4, 0, 0, 0)) + size.to_bytes(4, "little") + image
-    assert all(len(chunk.part) <= 232 for chunk, _ in parts)
+    # A message has at most 256 bytes: sync word, header, CRC and the header of the part take 24 of them.
+    assert all(len(chunk.part) <= 256 - 24 for chunk, _ in parts)
     assert [remaining for _, remaining in parts] == list(reversed(range(len(parts))))
 
 
@@ -109,7 +113,7 @@ def make_board(board: Simulated, clock: VirtualClock, firmware=None, words=None)
 
 
 def ignore(sent: int, of: int) -> None:
-    """Take no notice of the progress."""
+    """Ignore the progress of a download."""
 
 
 @pytest.fixture
@@ -127,10 +131,10 @@ def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
     assert board.cores.flash == b""
     assert board.cores.ram == DATA
     radar.arm(4)
-    # After a fault arming resets the board, which empties its RAM: the image is sent again (0x4080 is a part of it).
-    radar.fail("asked to")
+    # After a fault arming resets the board, which empties its RAM: the image is sent again.
+    radar.fail("a fault")
     radar.arm(4)
-    assert board.executed.count(0x4080) == 2 * len(split_into_chunks(DATA))
+    assert board.executed.count(FIRMWARE_PART) == 2 * len(split_into_chunks(DATA))
 
 
 def test_without_an_image_a_new_board_is_refused(new, clock):
@@ -143,7 +147,7 @@ def test_without_an_image_a_new_board_is_refused(new, clock):
 
 def test_an_image_in_the_flash_is_not_downloaded_again(board, clock):
     make_board(board, clock, IMAGE).configure()
-    assert 0x4080 not in board.executed
+    assert FIRMWARE_PART not in board.executed
 
 
 @pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
@@ -173,8 +177,7 @@ def test_a_board_that_reports_a_hardware_fault_is_refused_after_any_download(clo
     board.cores.hardware_bits = 1 << bit
     with pytest.raises(DeviceError):
         make_board(board, clock, image).configure()
-    # The RF core was not powered up.
-    assert 0x4000 not in board.executed
+    assert RF_POWER_UP not in board.executed
     with pytest.raises(DeviceError):
         make_board(board, clock).write_flash(IMAGE, ignore)
     assert board.cores.flash == DATA
@@ -189,6 +192,7 @@ def test_a_board_whose_die_id_is_that_of_another_board_is_not_configured(clock, 
     )
     with expect_refusal(ErrorCode.MISMATCH, "5eed0001", "5eed0002"):
         use(radar)
+    # No channel was switched on (message 0x0080).
     assert 0x0080 not in board.executed
 
 
@@ -219,7 +223,7 @@ def test_an_image_for_another_rom_is_not_sent(clock, rom, flash):
     for use in (lambda r: r.write_flash(IMAGE, ignore), lambda r: r.configure()):
         with expect_refusal(ErrorCode.MISMATCH, ".".join(map(str, rom))):
             use(make_board(board, clock, IMAGE))
-    assert 0x4080 not in board.executed
+    assert FIRMWARE_PART not in board.executed
     assert board.cores.flash == flash
 
 
@@ -235,8 +239,9 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
     setattr(board.cores, core, rom)
     with expect_refusal(ErrorCode.MISMATCH, text):
         make_board(board, clock, image).configure()
-    # Configuration of the device, power-up of the RF core, and the questions for the versions.
-    assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
+    # Only these messages may have been sent: configuration of the device, power-up of the RF core, and the questions
+    # for the versions.
+    assert set(board.executed) <= {0x404C, RF_POWER_UP, 0x0220, 0x40E0}
 
 
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["from RAM", "from flash"])
@@ -291,8 +296,9 @@ def test_a_restart_during_a_download_ends_it_immediately(clock, part):
     words = Restarts(board, clock, part + 1)
     with expect_refusal(ErrorCode.RADAR_RESTARTED, f"part {part} of 35"):
         make_board(board, clock, words=words).write_flash(IMAGE, ignore)
-    # No message was sent after the restart; virtual time, with a limit that is chosen.
+    # No message was sent after the restart.
     assert words.later == 0
+    # In virtual time; 0.4 s is measured.
     assert clock.time < 5.0
 
 
@@ -303,8 +309,10 @@ def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
     def refuse_seventh(data, remaining):
         calls.append(remaining)
         if len(calls) == 7:
-            # Error number 7, no data, no delay.
-            return 7, b"", 0.0
+            error_number = 7
+            no_data = b""
+            no_delay_s = 0.0
+            return error_number, no_data, no_delay_s
         return download(data, remaining)
 
     monkeypatch.setattr(new.cores, "_download", refuse_seventh)
@@ -325,9 +333,10 @@ def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
         make_board(new, clock).write_flash(IMAGE, ignore)
 
 
-@pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
-def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, reported, warned):
-    """Another patch than that of the file is a warning; the old patch, or none, is an error."""
+@pytest.mark.parametrize(("reported", "is_warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
+def test_another_patch_than_that_of_the_image_is_a_warning_and_none_is_an_error(
+    new, clock, monkeypatch, reported, is_warned
+):
     execute = new.cores._apply_setting_or_query
 
     def answer(number, data):
@@ -338,7 +347,7 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
 
     monkeypatch.setattr(new.cores, "_apply_setting_or_query", answer)
     radar = make_board(new, clock, IMAGE)
-    if warned:
+    if is_warned:
         radar.configure()
         assert any("reports patch 2.9.3.0 after the download" in line for line in radar.warnings)
         return

@@ -1,4 +1,4 @@
-"""Messages and commands at the limits of their fields, and events of every kind."""
+"""Messages and commands are accepted up to the limits of their fields; events have their meaning."""
 
 import binascii
 import struct
@@ -93,11 +93,12 @@ def block(number: int, data: bytes, length: int | None = None) -> bytes:
         (block(1, b"abc") + b"\xff", 1, [b"abc"]),
         (block(1, b"a") + 3 * b"\xff", 1, [b"a"]),
         (block(1, b"") + block(2, b"xy") + 2 * b"\xff", 2, [b"", b"xy"]),
-        # Four bytes after the last sub-block; a length below that of its header; one longer than the body; and a second
-        # sub-block that is missing, without and with padding in its place.
+        # Four bytes of padding
         (block(1, b"abcd") + 4 * b"\xff", 1, None),
-        (block(1, b"abcd", length=3) + b"", 1, None),
+        # A length below that of the sub-block's header, and one beyond the body
+        (block(1, b"abcd", length=3), 1, None),
         (block(1, b"abcd", length=9), 1, None),
+        # The second sub-block is missing, without and with padding in its place.
         (block(1, b"abcd"), 2, None),
         (block(1, b"abcd") + b"\xff" * 3, 2, None),
     ],
@@ -152,7 +153,7 @@ def test_times_of_power_up_are_ticks_of_5_ns():
 
 @pytest.mark.parametrize("names", [("LS", "RH", "RV"), ("M", "A", "Z")])
 def test_only_the_transmitting_board_switches_a_transmitter_on(names):
-    """Whatever the boards are called."""
+    """The role of a board counts, not its name."""
     rig = make_native_rig()
     boards = tuple(msgspec.structs.replace(board, name=name) for board, name in zip(rig.boards, names, strict=True))
     native = dict(zip(names, rig.radar.native.values(), strict=True))

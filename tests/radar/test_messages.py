@@ -1,4 +1,4 @@
-"""mmWaveLink messages: round trip, every flipped bit noticed."""
+"""mmWaveLink messages are decoded from their bytes, and every flipped bit is detected."""
 
 import struct
 
@@ -50,13 +50,13 @@ def test_noise_after_a_sync_word_is_refused(noise: bytes):
 
 
 def test_checksum_of_the_control_document():
-    """The example of its table 2.6: five words of a header and their checksum."""
+    """Table 2.6 of TI's interface control document has the five words of a header and their checksum."""
     words = struct.pack("<5H", 0x0281, 0x0800, 0x040C, 0x0000, 0x0001)
     assert m.checksum(words) == 0xF171
 
 
 def test_the_16_bit_crc_is_ccitt_false():
-    """Its published check value is the CRC of "123456789"; messages of real devices are in test_received.py."""
+    """The published check value of a CRC is that of "123456789"; messages of real devices are in test_received.py."""
     assert m.crc(b"123456789", 2) == bytes.fromhex("b129")
 
 
@@ -86,7 +86,13 @@ def test_a_message_that_exceeds_its_limits_is_refused(blocks, sequence, value):
     ],
 )
 def test_numbers_beyond_their_bits_are_refused(message_id, sequence, fits):
-    message = m.Message(m.Direction.HOST_TO_MAIN, m.Kind.COMMAND, message_id, (m.SubBlock(1),), sequence)
+    message = m.Message(
+        direction=m.Direction.HOST_TO_MAIN,
+        kind=m.Kind.COMMAND,
+        message_id=message_id,
+        blocks=(m.SubBlock(1),),
+        sequence=sequence,
+    )
     if fits:
         assert m.encode(message)
         return

@@ -60,7 +60,7 @@ def test_a_stream_may_be_split_anywhere(words, data):
 
 @pytest.mark.parametrize("byte", [0, 1, 3, 4, 8])
 def test_an_invalid_stream_is_detected(chip, byte):
-    """The simulated chip detects violations of the SPI protocol: that it reports none in the tests above counts."""
+    """The tests above rely on the simulated chip to report violations of the SPI protocol."""
     stream = bytearray(encode_writes([0x1234, 0x5678]))
     stream[byte] ^= 0x09
     chip.take("A", bytes(stream))

@@ -123,7 +123,7 @@ def test_a_board_that_missed_a_pulse_is_not_done(radars, usb):
 
 
 def test_two_names_for_one_board_are_refused(rig, usb, clock):
-    # The chip at RV's serial number says that it is the one at RH's.
+    # The chip at RV's serial number reports the die id of the one at RH's.
     usb.boards["FTRV"].cores.die_number = 2
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "RH and RV"):
         NativeRadars(rig, usb.open, clock)
@@ -131,13 +131,15 @@ def test_two_names_for_one_board_are_refused(rig, usb, clock):
 
 @pytest.mark.parametrize("die_id", ["zero", "refused"])
 def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path, monkeypatch, die_id):
-    """Two boards would share a file, but gains and filters differ between boards."""
+    """A file without a die id would be used for several boards, whose gains and filters differ."""
 
     def refuse_die_id(execute):
         def execute_or_refuse(number, *rest):
             if number == GET_DIE_ID.ID:
-                # Error number 6, no data, no delay.
-                return 6, b"", 0.0
+                error_number = 6
+                no_data = b""
+                no_delay_s = 0.0
+                return error_number, no_data, no_delay_s
             return execute(number, *rest)
 
         return execute_or_refuse
@@ -163,9 +165,10 @@ def test_after_a_fault_the_next_row_resets_only_that_board(radars, usb):
     assert "not triggered by a pulse" in states["RH"].detail
     assert states["RV"].state is RadarState.ARMED
     radars.arm(FRAMES)
-    # 0x4000: power-up of the RF core.
-    assert faulty_board.executed.count(0x4000) == 2
-    assert usb.boards["FTRV"].executed.count(0x4000) == 1
+    # A reset is followed by a power-up of the RF core.
+    rf_power_up = 0x4000
+    assert faulty_board.executed.count(rf_power_up) == 2
+    assert usb.boards["FTRV"].executed.count(rf_power_up) == 1
     usb.pulses(FRAMES)
     assert {s.state for s in radars.states().values()} == {RadarState.DONE}
 
@@ -180,16 +183,18 @@ def test_the_report_fits_the_manifest_and_is_returned_once(radars):
     assert set(result["boards"]) == {"LS", "RH", "RV"}
     assert result["boards"]["RV"]["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
     assert set(result["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
+    # All messages of the bring-up and the arming, 53 here
     assert len(result["boards"]["RV"]["sent"]) > 40
-    # The receivers' offset centres the direct path, at 0.45 of the sample rate of 2.15 MHz: 0.97 MHz.
-    assert 0.9e6 < result["direct_if_hz"]["RH"] < 1.05e6
+    # The receivers' offset puts the direct path in the middle of the band.
+    middle_of_band_hz = 0.45 * 2.15e6
+    assert result["direct_if_hz"]["RH"] == pytest.approx(middle_of_band_hz, rel=0.05)
     assert any(c.startswith("IF budget of RV") for c in result["constraints"])
     second_report = radars.report()
     assert second_report["boards"]["RV"]["sent"] == []
     assert "constraints" not in second_report
 
 
-def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock):
+def test_settings_that_the_radar_cannot_have_are_refused_before_a_board_is_opened(rig, usb, clock):
     def fail_to_open(serial: str) -> BoardWords:
         raise AssertionError(f"{serial} was opened")
 

@@ -1,4 +1,4 @@
-"""Random faults at random times: no hang, no traceback, no false success, and the right cause in the error.
+"""After a random fault at a random time a radar board's row ends in time, in an error with the right cause or well.
 
 A case is one fault at a random time of a board's bring-up or row, and the cause that the error must name.
 """
@@ -109,10 +109,10 @@ def _flip_once(rng: random.Random) -> Case:
 def _make_noise_case(rng: random.Random) -> Case:
     draws = random.Random(rng.random())
     # Share of words of which one bit is flipped.
-    share = rng.choice((0.01, 0.05, 0.3))
+    disturbed_share = rng.choice((0.01, 0.05, 0.3))
 
     def flip_sometimes(word: int) -> int:
-        if draws.random() < share:
+        if draws.random() < disturbed_share:
             return word ^ 1 << draws.randrange(16)
         return word
 
@@ -120,8 +120,8 @@ def _make_noise_case(rng: random.Random) -> Case:
 
 
 def _make_event_case(rng: random.Random) -> Case:
-    # Number and data of an event, and what an error after it has to name: "-" for events that are not faults, and "."
-    # for one of any kind.
+    # Number and data of an event, and the pattern that the error must match: "-" for events that are not faults, "."
+    # for an event of any kind.
     number, data, cause = rng.choice(
         (
             (0x1002, struct.pack("<BBH", rng.randrange(7), rng.randrange(9), 100) + bytes(28), "RF core fault"),
@@ -257,9 +257,9 @@ def run(case: Case, at: int) -> Outcome:
     )
 
 
-# Virtual time in which a run ends. A bring-up of which every command is sent three times would be given up long before.
+# Virtual time in which a run ends
 LONGEST_S = 45.0
-# Share of the errors that must name the right cause; chosen.
+# Fraction of the errors that must name the right cause
 NAMED = 0.95
 
 
@@ -305,7 +305,7 @@ def test_a_random_fault_ends_in_an_error_with_the_right_cause_or_does_no_harm(cl
     print(f"{cases} faults, {failed} ended in an error, {len(unnamed)} of these without the right cause", dict(kinds))  # noqa: T201
     for line in unnamed[:20]:
         print(line)  # noqa: T201
-    # Enough of the faults had an effect (chosen).
+    # The law is not empty: at least a quarter of the faults had an effect.
     assert failed > cases / 4
     assert len(unnamed) <= (1 - NAMED) * failed
 
@@ -327,7 +327,10 @@ def test_after_a_repaired_fault_the_next_row_runs():
 
 
 def test_most_drawn_faults_happen_within_the_run(clean):
-    """So that the law above is not empty: more than 24 of 40 (chosen)."""
+    """Otherwise the law above would be tested without faults."""
     del clean
-    struck = [run(*draw(random.Random(number))).struck for number in range(40)]
-    assert sum(struck) > 24
+    struck = []
+    for number in range(40):
+        case, transfer = draw(random.Random(number))
+        struck.append(run(case, transfer).struck)
+    assert sum(struck) > 0.6 * len(struck)

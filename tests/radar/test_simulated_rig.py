@@ -1,4 +1,4 @@
-"""The simulated rig under native control: its rig file, its signals, and its chip behind a socket."""
+"""The simulated rig under native control: its rig file keeps all constraints, its boards are reached over sockets."""
 
 import socket
 import threading
@@ -50,7 +50,7 @@ def served_board():
 
 
 class PatientClock(SystemClock):
-    """Its timeouts are a thousand times as long, because the thread that serves the board may be delayed."""
+    """A clock that runs a thousand times slower: the thread that serves the board may be delayed."""
 
     def now(self) -> float:
         return super().now() / 1000

@@ -56,8 +56,8 @@ def set_table_values(**tables):
 
 V_MOVED = add_mount_steps("RV", last=[{"shift_mm": [0.0, 0.05, 0.0]}])
 
-# Changes after which a metal reference does not hold, because phases or amplitudes of images change; and what the
-# message must name.
+# Changes after which a metal reference does not hold, because phases or amplitudes of images change; and the
+# words that the message must have.
 CHANGES_THAT_MATTER = {
     "V moved": (V_MOVED, ["RV"]),
     "H turned about the line of its antennas": (add_mount_steps("RH", first=[{"turn_deg": 1.0, "about": "x"}]), ["RH"]),
@@ -235,7 +235,9 @@ def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band
 
 def test_missing_sub_bands_are_refused_before_rows_are_read(full_metal, take_scan_with, tmp_path):
     scan = take_scan_with(full_metal)
-    assert main(["process", str(scan.path), "--bands", "2", "--out", str(tmp_path / "out"), "--model", "none"]) == 3
+    arguments = ["process", str(scan.path), "--bands", "2", "--out", str(tmp_path / "out"), "--model", "none"]
+    unusable_input = 3
+    assert main(arguments) == unusable_input
     assert not (tmp_path / "out" / "image.npz").exists()
 
 
@@ -246,6 +248,7 @@ def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded_metal, tak
     reference = load_metal_plane(pipeline, BANDS)
     (metal_row,) = pipeline.find_materials(pipeline.form_images(), KnownScene(metal=reference)).rows()
     assert len(metal_row.bands) == BANDS
+    # Differences of up to 0.005 are measured.
     for ratio in (metal_row.ratio, *(band.ratio for band in metal_row.bands)):
         assert ratio.value == pytest.approx(1.0, abs=0.02)
     assert pipeline.quality.notes["metal_reference"].sub_bands == BANDS

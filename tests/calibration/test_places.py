@@ -110,9 +110,10 @@ def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
         ]
     )
     truth = np.array([*SHIFTS["RH"], *SHIFTS["RV"], DEEPER_MM, *target_mm, TARGET_TURN_DEG])
-    # Nine values in mm and one in degrees; the limits are chosen.
+    # Nine values in mm and one in degrees
     assert np.all(errors < [0.3] * 9 + [0.05])
     np.testing.assert_array_less(np.abs(values - truth), 5 * errors)
+    # The fraction of the echoes' power that the estimated places explain; 0.998 is measured.
     assert file.explained > 0.9
     for name, board in file.boards.items():
         antennas = Antennas.from_rig(true_rig, true_rig.by_name(name))

@@ -1,7 +1,7 @@
 """Rows with all faults of a card and a network: data is original or masked, and not masked without reason.
 
-A state machine takes one record after another, each with drawn faults; leftovers of a record come with the
-next. 2,000 records; `--long` takes 20,000 and draws new ones.
+A state machine takes one record after another, each with drawn faults. Packets that are late in one record come with
+the next. The test takes 2,000 records; `--long` takes 20,000 and draws new ones.
 """
 
 import random
@@ -35,7 +35,7 @@ GRIDS = [
     (1456, 7),
     (512, 30),
 ]
-# So many perfect records in sequence may be refused, after anything that may have happened.
+# Perfect records that may be refused in sequence, whatever has happened before
 MAX_REFUSED = 1
 
 

@@ -20,6 +20,9 @@ from polysight_shared.errors import ErrorCode
 from polysight_simulators.cards import Network
 from polysight_simulators.faults import Faults
 
+# No bit of the status is set.
+NO_STATUS = Status(0)
+
 
 def test_a_card_is_configured_with_the_bytes_that_a_real_card_accepted(scripted_card):
     client, card = scripted_card(lambda code, _: [reply(code, 0x0402 if code == Code.VERSION else 0)])
@@ -108,7 +111,7 @@ def test_a_flood_of_replies_of_another_code_ends_a_command_with_an_error(scripte
     monkeypatch.setattr(card, "time", SimpleNamespace(monotonic=itertools.count(0.0, 1e3).__next__))
     with expect_refusal(ErrorCode.NO_ANSWER, "ALIVE"):
         client.check_alive()
-    assert client.take_status() == Status(0)
+    assert client.take_status() == NO_STATUS
 
 
 def test_record_start_is_never_sent_twice_without_a_stop(scripted_card):
@@ -139,8 +142,8 @@ def test_a_command_port_in_use_is_an_error_with_the_command_that_finds_its_user(
 
 
 @pytest.mark.parametrize("between", [True, False])
-def test_end_of_the_record_before_is_not_that_of_this_one(scripted_card, between):
-    """The status came after the stop: before the next start was sent, or between that and its reply."""
+def test_the_end_of_the_previous_record_does_not_end_this_one(scripted_card, between):
+    """The status comes after the stop: before the next start is sent, or between that and its reply."""
     late = [reply(Code.STATUS, Status.RECORD_COMPLETED)]
     client, card = scripted_card(
         lambda code, n: [*(late if between and code == Code.RECORD_START and n == 2 else []), reply(code)]
@@ -151,7 +154,7 @@ def test_end_of_the_record_before_is_not_that_of_this_one(scripted_card, between
         card.say(reply(Code.STATUS, Status.RECORD_COMPLETED | Status.DDR_FULL))
         assert select.select([client], [], [], HANG_S)[0]
     client.record_start()
-    assert client.take_status() == Status(0)
+    assert client.take_status() == NO_STATUS
 
 
 def test_wait_for_a_completed_record_has_a_timeout(scripted_card):
@@ -168,7 +171,7 @@ def test_wait_for_a_completed_record_has_a_timeout(scripted_card):
     assert client.take_status() == Status.RECORD_COMPLETED
     client.record_start()
     client.wait_completed(0.05)
-    assert client.take_status() == Status(0)
+    assert client.take_status() == NO_STATUS
 
 
 def test_addresses_in_the_eeprom_have_their_last_byte_first():
@@ -267,7 +270,7 @@ def test_a_card_that_could_not_write_its_eeprom_is_not_asked_again(scripted_card
 
 
 @pytest.mark.parametrize(("repeats", "answers", "is_alone"), [(0, 1, True), (0, 2, False), (1, 2, True), (1, 3, False)])
-def test_a_late_answer_is_not_that_of_a_second_card(scripted_card, monkeypatch, repeats, answers, is_alone):
+def test_a_late_answer_is_not_taken_for_that_of_a_second_card(scripted_card, monkeypatch, repeats, answers, is_alone):
     """The answer to the first request comes with that to the second one: one card has answered both.
 
     More answers than requests show a second card with the same address.
@@ -299,7 +302,7 @@ def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch)
 
 
 def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_card, monkeypatch):
-    """Cards were exchanged, or a second one answers now. That the kernel has forgotten the address is not an error."""
+    """Cards were exchanged, or a second one answers now. It is not an error if the kernel has forgotten the address."""
     client, _ = scripted_card(lambda code, _: [reply(code, 0)])
     neighbours = {"mac": "12:34:56:78:90:12"}
     monkeypatch.setattr(card, "neighbour_mac", lambda _: neighbours["mac"])

@@ -167,7 +167,7 @@ def test_listening_ends_with_a_complete_row_for_any_counters_of_the_card(cards, 
     packetiser = running_cards.endpoints["RH"].card._packetiser
     packetiser.sequence = 77_777
     packetiser.byte_count = 77_776 * packetiser.payload_bytes
-    # An hour: listening must end by itself, with the row.
+    # The limit is an hour: listening must end with the row.
     process = card("--listen", "3600", "--json")
     for name in ("RH", "RV"):
         radar = read_verdicts(process)[name]["radar"]

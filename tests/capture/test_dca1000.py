@@ -1,4 +1,4 @@
-"""The card's bytes, compared with recordings of a real card."""
+"""Requests, replies and samples of the DCA1000 card are encoded and decoded as in recordings of a real card."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_requests_replies_and_headers_are_those_of_a_real_card():
     ],
 )  # fmt: skip
 def test_malformed_replies_are_refused(raw):
-    """Nothing, too short, a wrong last or first byte, cut, and one byte too long."""
+    """The replies are empty, too short, with a wrong last, first or second byte, cut, and one byte too long."""
     with pytest.raises(ProtocolError):
         d.decode_reply(raw)
 

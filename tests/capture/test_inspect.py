@@ -196,6 +196,7 @@ def test_the_record_of_a_real_card_is_placed_and_its_layout_recognized():
     assert r.card.record.complete
     assert r.card.record.counts.placed == 12
     assert r.card.tail_bytes == 16384 - 11 * 1456
+    # A card sends the short last packet 2 s after the data: its timer is exact to a millisecond.
     assert r.card.tail_after_s == pytest.approx(2.0, abs=0.001)
     assert r.card.status == Status.RECORD_COMPLETED
     assert ("RECORD_START", 0) in r.card.replies

@@ -48,7 +48,7 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
 
 @given(at=st.integers(2, 85), lost=st.sampled_from([1, 2, 5]))
 def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_arrival(at, lost):
-    """Its counters started again twice: nothing shows which bytes follow which."""
+    """The counters started again twice, so that nothing shows which bytes follow which."""
     size = 91 * 4096
     record = Card(size).record(resets=(at,))
     placed, _ = place(size, record.packets[: len(record.packets) - lost], Counters(0, 1), 4096)
@@ -57,12 +57,12 @@ def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_a
 
 
 def test_frames_of_a_row_with_conflicts_are_not_moved():
-    """Only a row about which nothing else is unclear is written again."""
+    """A row is written again with its frames moved only if everything else about it is clear."""
     size = 62 * 4096
     frame = 4096
     start = Counters(70_000, 9)
 
-    # The card has recorded a frame fewer than the row has: `slipped` says that frames may be moved.
+    # The card has recorded a frame fewer than the row has. `slipped` means that frames may be moved.
     short_row, _ = place(size, Card(size - frame, 70_000, 9).record().packets, start, frame)
     assert short_row.slipped
     assert not short_row.holes

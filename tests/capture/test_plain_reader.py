@@ -125,7 +125,7 @@ def test_all_files_of_a_simulated_scan_folder_are_read(tmp_path):
             assert zlib.crc32((folder / board["file"]).read_bytes()) == int(board["crc32"], 16)
             assert index["missing"] == []
             assert samples.shape == (4, fact["pulses"], SAMPLES)
-            # There is a signal; the limit is chosen.
+            # There is a signal.
             assert np.abs(samples).mean() > 100
     events = read_events(folder / "events.msgpack")
     assert [event["seq"] for event in events] == list(range(1, len(events) + 1))

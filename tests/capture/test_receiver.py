@@ -128,7 +128,7 @@ def test_between_rows_the_progress_is_that_of_no_row():
 
 @pytest.mark.parametrize("last_bytes", [FULL, 100])
 def test_a_row_is_reported_as_complete_without_a_request(board, card, tmp_path, monkeypatch, last_bytes):
-    """Also if its last packet is full, and not marked by its size."""
+    """This also holds if the last packet is full, so that its size does not show that it is the last one."""
     for name in ("take_core", "take_priority"):
         monkeypatch.setattr(receiver_process, name, lambda *_, **__: (None, ""))
     data = draw_noise(3 * FULL + last_bytes, 8)
@@ -368,8 +368,9 @@ def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, ca
         assert receiver.packets[0, :13].tobytes() == b"0123456789abc"
         assert receiver.lengths[:2].tolist() == [13, 10]
         first, second = receiver.times_ns[:2].tolist()
-        # The kernel stamps with the wall clock, which may run at a slightly different rate: 1 ms is allowed (chosen).
-        assert before_ns - 1_000_000 < first < second <= time.monotonic_ns()
+        # The kernel stamps with the wall clock, which may run at a slightly different rate: 1 ms is allowed.
+        assert before_ns - 1_000_000 < first
+        assert first < second <= time.monotonic_ns()
         assert receiver.receive() == 0
 
 
@@ -388,11 +389,13 @@ def test_the_kernel_counts_the_packets_that_a_full_socket_drops(board, card):
         enlarge_receive_buffer(sock, 1 << 14)
         receiver = BatchReceiver(sock, board.card_address)
         assert network.count_kernel_drops(sock) == 0
-        for _ in range(100):
+        sent = 100
+        for _ in range(sent):
             card.sendto(bytes(1466), (board.host_address, board.data_port))
         received = receiver.receive()
-        assert 0 < received < 100
-        assert network.count_kernel_drops(sock) == 100 - received
+        # The buffer of 16 KiB holds some of the packets, and not all.
+        assert 0 < received < sent
+        assert network.count_kernel_drops(sock) == sent - received
 
 
 def test_packets_that_came_before_the_wall_clock_was_set_have_the_time_of_the_read(board, card, monkeypatch):

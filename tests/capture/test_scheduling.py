@@ -84,7 +84,7 @@ def test_without_permission_core_and_priority_are_warnings(monkeypatch):
 def test_buffer_below_two_bursts_is_refused_with_the_command(tmp_path):
     limit = tmp_path / "rmem_max"
     limit.write_text("212992\n")
-    # 16 frames of 4096 bytes, 64 KiB. Arguments: what the system granted, what the rig file asks for.
+    # 16 frames of 4096 bytes, 64 KiB. The sizes in bytes are the granted and the requested one.
     burst = 16 * 4096
     assert check_receive_buffer("RH", 8 << 20, 8 << 20, burst, limit) == ""
     warning = check_receive_buffer("RH", 212_992, 8 << 20, burst, limit)

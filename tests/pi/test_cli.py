@@ -1,4 +1,4 @@
-"""`polysight-pi`: starting, ending, dying; commands with and without a running service; errors and exit status."""
+"""The program `polysight-pi`: its start and end, its commands with and without a running service, its errors."""
 
 import errno
 import json
@@ -20,6 +20,12 @@ from polysight_shared.faults import PiFault
 from polysight_shared.sockets import create_replier, make_server_context
 from polysight_simulators.loopback import move_to_free_subnet
 
+# Exit statuses of the program
+SUCCESS = 0
+CHECK_FAILED = 1
+USAGE_ERROR = 2
+FAILURE = 5
+
 
 @pytest.fixture
 def run_command(capsys):
@@ -40,7 +46,9 @@ def test_sigterm_ends_the_row_and_the_program(instrument, start, hub, stage):
     stage.stays_after = 2
     host.start_row(1)
     host.wait_for_event(m.Capture, lambda e: e.row_index == 1)
-    assert program.end() == (0, "", "")
+    no_output = ""
+    no_errors = ""
+    assert program.end() == (SUCCESS, no_output, no_errors)
     last = host.wait_for_event(m.RowFinished)
     assert (last.row_index, last.status) == (1, "aborted")
     assert not host.list_events(m.RunStopped)
@@ -53,13 +61,13 @@ def test_simulated_wires_need_neither_gpiod_nor_numpy(config, hub, stage, tmp_pa
     path = os.pathsep.join(filter(None, [str(tmp_path / "blocked"), os.environ.get("PYTHONPATH")]))
     with Process(config, "--wires", hub, "--stage-port", stage.port, PYTHONPATH=path) as p:
         assert p.ready_line[0] == "ready", p.popen.communicate()
-        assert p.end()[0] == 0
+        assert p.end()[0] == SUCCESS
 
 
 def test_a_misspelt_key_of_the_rig_file_is_named_with_exit_status_2(run_command, config):
     config.write_text(config.read_text().replace("heartbeat_ms = 50", "heartbeet_ms = 50"))
     status, _, err = run_command("run", "--config", config)
-    assert status == 2
+    assert status == USAGE_ERROR
     assert "heartbeet_ms" in err
     assert "do:" in err
 
@@ -67,11 +75,11 @@ def test_a_misspelt_key_of_the_rig_file_is_named_with_exit_status_2(run_command,
 def test_an_open_address_needs_keys(run_command, config, tmp_path, hub, stage):
     args = ("--config", config, "--wires", hub, "--stage-port", stage.port, "--command-address", "tcp://0.0.0.0:*")
     status, _, err = run_command("run", *args)
-    assert (status, "polysight-pi keys" in err) == (2, True)
-    assert run_command("keys", "--config", config)[0] == 0
+    assert (status, "polysight-pi keys" in err) == (USAGE_ERROR, True)
+    assert run_command("keys", "--config", config)[0] == SUCCESS
     assert (tmp_path / "keys" / "pi.key_secret").stat().st_mode & 0o077 == 0
     status, _, err = run_command("keys", "--config", config)
-    assert (status, "--replace" in err) == (2, True)
+    assert (status, "--replace" in err) == (USAGE_ERROR, True)
     with Process(*args[1:]) as p:
         assert p.ready_line[1].startswith("tcp://0.0.0.0:")
 
@@ -80,25 +88,25 @@ def test_check_names_every_hop(run_command, config, hub, stage):
     options = ("--config", config, "--wires", hub, "--stage-port", stage.port, "--json")
     status, out, _ = run_command("check", *options)
     findings = {f["name"]: f for f in json.loads(out)}
-    assert status == 0, findings
+    assert status == SUCCESS, findings
     assert {"plan", "simulated wires", "stage", "journal", "command address"} <= set(findings)
     status, out, _ = run_command("check", "--config", config, "--wires", hub)
-    assert (status, "fail  stage" in out, "do:" in out) == (1, True, True)
+    assert (status, "fail  stage" in out, "do:" in out) == (CHECK_FAILED, True, True)
 
 
 def test_without_the_service_commands_use_the_stage_themselves(run_command, instrument, write_config, hub, stage):
     config = write_config(set_stage_port(move_to_free_subnet(instrument), stage.port))
     options = ("--config", config, "--wires", hub, "--count", 3, "--json")
     status, out, _ = run_command("pulse", *options)
-    assert (status, [r["pulses"] for r in json.loads(out)]) == (0, [4, 4, 4])
+    assert (status, [r["pulses"] for r in json.loads(out)]) == (SUCCESS, [4, 4, 4])
     # `buzz` makes a motor sound, also before the first homing, which `jog` needs.
     for axis in "xy":
         assert json.loads(run_command("buzz", axis, "--config", config, "--json")[1]) == {"x_mm": 0.0, "y_mm": 0.0}
     assert [c.args for c in stage.seen if c.verb == "BUZZ"] == [(0,), (1,)]
-    assert run_command("jog", "--config", config, "--dx", 3)[0] != 0
+    assert run_command("jog", "--config", config, "--dx", 3)[0] != SUCCESS
     assert run_command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
     assert json.loads(run_command("jog", "--config", config, "--dx", 3, "--json")[1]) == {"x_mm": 3.0, "y_mm": 0.0}
-    assert run_command("events", "--config", config, "--limit-s", 0.1)[0] == 5
+    assert run_command("events", "--config", config, "--limit-s", 0.1)[0] == FAILURE
 
 
 def test_while_the_service_runs_commands_ask_it_or_are_refused(run_command, instrument, write_config, start, hub):
@@ -113,10 +121,10 @@ def test_while_the_service_runs_commands_ask_it_or_are_refused(run_command, inst
     assert "Heartbeat" in [json.loads(line)["type"] for line in out.splitlines()]
     for command in (("check", "--wires", hub), ("pulse", "--wires", hub), ("jog",)):
         status, _, err = run_command(*command, "--config", config)
-        assert status == 5
+        assert status == FAILURE
         assert rig.pi.command_address in err
     status, _, err = run_command("events", "--config", config, "--scan-id", "none")
-    assert (status, "'none'" in err) == (5, True)
+    assert (status, "'none'" in err) == (FAILURE, True)
 
 
 IMPOSSIBLE_NUMBERS = [
@@ -134,7 +142,7 @@ def test_an_impossible_number_is_a_usage_error_that_names_it(config, capsys, com
         with pytest.raises(SystemExit) as e:
             main([command, "--config", str(config), f"{option}={value}"])
         err = capsys.readouterr().err
-        assert e.value.code == 2
+        assert e.value.code == USAGE_ERROR
         assert repr(value) in err
         # Names of functions of the program are not for people.
         assert "_parse" not in err
@@ -146,17 +154,17 @@ def test_a_name_that_no_scan_can_have_and_an_end_without_a_run(run_command, inst
     config = write_config(rig)
     for name in ("../x", "", "a\nb"):
         status, _, err = run_command("events", "--config", config, "--scan-id", name)
-        assert status == 5
+        assert status == FAILURE
         assert "no journal of scan" in err
         # It is not taken for a message of another release.
         assert "releases" not in err
     status, _, err = run_command("take-over", "end", "--config", config)
-    assert (status, "no run is active" in err) == (5, True)
+    assert (status, "no run is active" in err) == (FAILURE, True)
 
 
 def test_take_over_reports_that_no_service_has_run(run_command, config):
     status, _, err = run_command("take-over", "abort", "--config", config)
-    assert (status, "has not run" in err, "systemctl" in err) == (5, True, True)
+    assert (status, "has not run" in err, "systemctl" in err) == (FAILURE, True, True)
 
 
 def test_the_advice_for_a_file_of_another_user_is_a_complete_command(run_command, config, monkeypatch):
@@ -168,7 +176,7 @@ def test_the_advice_for_a_file_of_another_user_is_a_complete_command(run_command
     monkeypatch.setattr("pathlib.Path.read_text", refuse)
     monkeypatch.setattr("polysight_shared.config.load_instrument", lambda _: load_published_rig())
     status, _, err = run_command("take-over", "abort", "--config", config)
-    assert status == 5
+    assert status == FAILURE
     assert f"sudo -u polysight {PROGRAM} take-over abort --config {config}`" in err
 
 
@@ -177,7 +185,7 @@ def test_for_a_missing_rig_file_the_installed_one_is_advised(run_command, tmp_pa
     installed.touch()
     monkeypatch.setattr("polysight_pi.cli.RIG_FILE", str(installed))
     status, _, err = run_command("check", "--config", tmp_path / "none.toml")
-    assert (status, f"--config {installed}`" in err) == (2, True)
+    assert (status, f"--config {installed}`" in err) == (USAGE_ERROR, True)
 
 
 def test_the_advised_commands_for_keys_work(run_command, tmp_path):
@@ -190,15 +198,15 @@ def test_the_advised_commands_for_keys_work(run_command, tmp_path):
         return shlex.split(line.split("`")[1])
 
     status, _, err = run_command("keys", "--dir", folder, "--client", "laptop")
-    assert status == 2
+    assert status == USAGE_ERROR
     assert not folder.exists()
-    assert run_command(*read_advice(err)[1:])[0] == 0
-    assert run_command("keys", "--dir", folder, "--client", "laptop")[0] == 0
+    assert run_command(*read_advice(err)[1:])[0] == SUCCESS
+    assert run_command("keys", "--dir", folder, "--client", "laptop")[0] == SUCCESS
 
     (folder / "allowed_clients").write_bytes(b"\xff\xfe\x00")
     for option in (["--list"], ["--client", "b"], ["--revoke", "laptop"]):
         status, _, err = run_command("keys", "--dir", folder, *option)
-        assert (status, "allowed_clients" in err) == (2, True)
+        assert (status, "allowed_clients" in err) == (USAGE_ERROR, True)
     assert read_advice(err) == ["rm", str(folder / "allowed_clients")]
 
     (folder / "allowed_clients").write_text("")
@@ -207,7 +215,7 @@ def test_the_advised_commands_for_keys_work(run_command, tmp_path):
     (folder / "pi.key_secret").write_text("public-key = 'short'\nsecret-key = 'short'\n")
     with make_server_context() as context, expect_refusal(ErrorCode.FILE_MISSING, "CURVE") as error:
         create_replier(context, "tcp://0.0.0.0:*", folder).close()
-    assert run_command(*shlex.split(error.value.remedy.split("`")[1])[1:])[0] == 0
+    assert run_command(*shlex.split(error.value.remedy.split("`")[1])[1:])[0] == SUCCESS
 
 
 def test_a_full_disk_is_the_reported_cause_when_keys_cannot_be_made(run_command, tmp_path, monkeypatch):
@@ -216,7 +224,7 @@ def test_a_full_disk_is_the_reported_cause_when_keys_cannot_be_made(run_command,
 
     monkeypatch.setattr("polysight_pi.keys.create_certificates", fill)
     status, _, err = run_command("keys", "--dir", tmp_path / "keys")
-    assert status == 5
+    assert status == FAILURE
     assert "the disk is full" in err
     assert str(tmp_path) in err
     # More rights would not help.

@@ -58,12 +58,12 @@ def test_points_of_a_row_pass_at_its_speed_between_two_ramps():
     points_s, end_s = MOTION.time_points([])
     assert [later_s - earlier_s for earlier_s, later_s in pairwise(points_s)] == pytest.approx([0.1] * 3)
     # From rest to the first point: the ramp takes v / a = 0.1 s, and 400 steps at full speed 0.1 s. The firmware's ramp
-    # is made of whole steps, and so not exactly v / a: the tolerances here are chosen for that.
+    # is made of whole steps, and so takes not exactly v / a: hence the tolerances below.
     assert points_s[0] == pytest.approx(0.1 + 0.1, rel=0.05)
     assert end_s - points_s[-1] == pytest.approx(points_s[0], rel=0.02)
 
-    # A stop between the second and third point costs two ramps: each takes v / a = 0.1 s, for a way that takes half of
-    # that at full speed.
+    # A stop between the second and third point costs two ramps. Each takes v / a = 0.1 s; at full speed the same way
+    # takes half of that.
     stopped_s, stopped_end_s = MOTION.time_points([600 + 600])
     assert stopped_s[:2] == pytest.approx(points_s[:2], rel=0.03)
     assert stopped_end_s - end_s == pytest.approx(0.1, rel=0.1)

@@ -40,8 +40,7 @@ HOSTILE_VALUES: tuple[Any, ...] = (
     NAN, INF, -INF, -1, 0, 1, 2**31, 2**40, 2**63, 2**64 - 1, -(2**63), 1e308, -1e308, 5e-324, True, None, b"\0", "",
     "a\0b", "a\n", "..", "/etc/passwd", "../x", "x" * 300, "x" * 5000, "\u202e", [], [1], {}, {"a": 1}, [[[[[[]]]]]],
 )  # fmt: skip
-# By so much the resident memory of the program may grow in an attack. Chosen: one message may have 64 KiB, and
-# hundreds are under way.
+# By this the resident memory of the program may grow in an attack: 384 of the largest messages (64 KiB)
 BOUND_BYTES = 24 << 20
 BEGIN = m.BeginRun(
     scan_id="scan", plan=RasterPlan(8, 4, 2.0, 2.0), pulses=4, period_us=1500.0, width_us=1.0, speed_mm_s=20.0
@@ -213,20 +212,22 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
 
 # Lines of the stage in the test of a flood.
 FLOOD_LINES = 100_000
-# Ten digits, the most that a number in a line may have.
+# The largest number that a line may have: ten digits
 HUGE = 9_999_999_999
+# Numbers of alarms have at most three digits.
+ALARMS_END = 1000
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_an_impossible_position_is_ignored(pi, stage, sign):
     """The stage reports one of 50 km; status and events still have the last position that was possible."""
     stage.x = stage.y = sign * HUGE
-    for alarm in (-HUGE, -1, 1000, HUGE):
+    for alarm in (-HUGE, -1, ALARMS_END, HUGE):
         fields = {"state": "idle", "x": stage.x, "y": stage.y, "points": HUGE, "alarm": alarm}
         stage.say(Reply("status", fields={k: str(v) for k, v in fields.items()}))
     status = pi.host.wait_for_event(m.StageStatus, lambda e: e.points == HUGE)
     assert (status.x_mm, status.y_mm) == (0.0, 0.0)
-    assert 0 <= status.alarm < 1000
+    assert 0 <= status.alarm < ALARMS_END
     assert pi.host.ask(m.Status()).x_mm == 0.0
 
 
@@ -254,12 +255,12 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
         Reply("banner", fields={"fw": "x" * 60, "proto": "2"}), Reply("alarm", number=999), Reply("alarm", number=15),
         Reply("done", 7), Reply("ok", 7), Reply("error", None, 1),
     )  # fmt: skip
-    # 98 lines.
-    raw = b"".join(line.encode() for line in lines) * 14
+    repeats = 14
+    raw = b"".join(line.encode() for line in lines) * repeats
     ended = threading.Event()
 
     def flood() -> None:
-        for _ in range(FLOOD_LINES // 98):
+        for _ in range(FLOOD_LINES // (repeats * len(lines))):
             stage.say_raw(raw)
         ended.set()
 
@@ -278,12 +279,12 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
 MORE = 1
 LONG = 2
 COMMAND = 4
-# A client that could send so much was not stopped (chosen).
+# A client that could send so much (2 GiB, twice the memory of a Pi with 1 GiB) was not stopped.
 ENOUGH_BYTES = 2 << 30
 # Turns have 600 kB, 240 MB/s in all: twice what a Pi's network carries. Without a limit, loopback would fill the memory
 # of a busy machine before the program can act.
 TURNS_A_SECOND = 400
-# Chosen, below MemoryMax of the unit, 512 MiB.
+# Limit of the program's memory, below MemoryMax of the unit, 512 MiB
 HIGHEST_BYTES = 400 << 20
 # Signature, version 3.0, and the mechanism NULL, as a client.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)

@@ -100,18 +100,22 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
     assert Path(rig.pi.journal_dir).is_relative_to(service["ReadWritePaths"])
     assert Path(rig.pi.journal_dir).is_relative_to(Path("/var/lib") / service["StateDirectory"])
     assert (service["Type"], service["Restart"]) == ("notify", "on-failure")
-    # The executor notifies the watchdog, and a lost stage blocks it for 25 s. More than a minute of hanging is too long
-    # (chosen).
+    # The executor notifies the watchdog, and a lost stage blocks it for 25 s. A program that hangs is ended within a
+    # minute.
     assert 25 < int(service["WatchdogSec"]) <= 60
 
 
+# Of systemd's scale from 0 to 10
+LARGEST_EXPOSURE = 3.0
+
+
 def test_the_unit_exposes_little(analyze):
-    """systemd's exposure level is 0 for a program without any rights, and 10 for one without any limit; 3 is chosen."""
+    """systemd's exposure level is 0 for a program without any rights and 10 for one without any limit."""
     process = analyze("security", "--offline=yes", "--no-pager")
     exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", process.stdout)
     if exposure is None:
         pytest.skip(f"this systemd-analyze measures no file: {process.stderr.strip()}")
-    assert float(exposure[1]) <= 3.0, process.stdout
+    assert float(exposure[1]) <= LARGEST_EXPOSURE, process.stdout
 
 
 def test_pinned_versions_are_what_the_wheels_ask_for():
@@ -132,6 +136,7 @@ def test_pinned_versions_are_what_the_wheels_ask_for():
 
 def test_udev_rules_are_well_formed():
     lines = [x for x in (PI / "60-polysight.rules").read_text().splitlines() if x and not x.startswith("#")]
+    # The rules were found.
     assert len(lines) >= 4
     # KEY=="value", KEY{attribute}=="value", or an assignment with = or +=.
     pair = r'[A-Z]+(\{[A-Za-z_]+\})?(==|=|\+=)"[^"]*"'

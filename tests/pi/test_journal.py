@@ -239,7 +239,7 @@ def test_a_damaged_journal_is_logged(tmp_path):
 def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
     folder = Journal(tmp_path)
     folder.check_room("scan", 70_000)
-    # Exactly what a scan of 70,000 positions needs.
+    # Exactly the space that a scan of 70,000 positions needs.
     free = SPARE_BYTES + 70_000 * CAPTURE_BYTES
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     folder.check_room("scan", 70_000)
@@ -271,7 +271,7 @@ ROW_DONE: dict[str, Any] = {
 
 
 def test_a_row_that_is_not_journalled_is_not_done(tmp_path, monkeypatch):
-    """Also a row that ends after the disk was full, before the run is stopped, is a fault."""
+    """A row that ends after the disk was full, before the run is stopped, is a fault, too."""
     published = []
     folder = Journal(tmp_path, published.extend)
     folder.open("scan", RasterPlan(2, 2, 1.0, 1.0), 0)

@@ -1,4 +1,4 @@
-"""What the watch of the Pi's memory does where a client fills it: drawn sizes, no waits; and one in this process."""
+"""The Pi's memory is watched: clients that fill it are disconnected. One test uses the memory of this process."""
 
 import os
 from typing import Any

@@ -122,7 +122,7 @@ def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
     assert (bench.state, bench.list_events(m.Fault)) == ("running", [])
     bench.t += LIMIT_S + 0.001
     bench.run_turn()
-    # From the begin of the row on it is watched.
+    # From the beginning of the row on it is watched.
     assert bench.list_events(m.Fault)[0].number == PiFault.HOST_LOST
 
 
@@ -232,7 +232,7 @@ def test_only_the_owner_commands_a_run(owner_in_row, stage):
 
 
 def test_a_command_for_an_earlier_take_of_a_row_does_not_move_the_stage(host, stage):
-    """It may be a late copy, or come from a faulty program: takes of a row only increase.
+    """Such a command is a late copy, or that of a faulty program: the numbers of a row's takes only increase.
 
     The last command may be repeated, if its answer was lost; it acts once.
     """

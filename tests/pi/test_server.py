@@ -152,7 +152,9 @@ def test_abort_ends_the_row_and_the_next_one_runs_without_homing(host_in_row, st
     host.must_accept(m.Abort(reason="enough"))
     row_finished = host.wait_for_event(m.RowFinished)
     assert (row_finished.status, row_finished.fault, row_finished.reason) == ("aborted", PiFault.ABORTED, "enough")
-    assert row_finished.bursts == len(host.list_events(m.Capture)) < 8
+    assert row_finished.bursts == len(host.list_events(m.Capture))
+    # Not the whole row of eight points
+    assert row_finished.bursts < 8
     host.wait_for_state("ready")
     stage.stays_after = None
     assert host.run_row(0, take=2).status == "done"

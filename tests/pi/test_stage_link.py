@@ -72,7 +72,7 @@ def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage, connect):
 
 
 def test_a_line_that_always_arrives_damaged_is_sent_four_times(dry_stage, connect, monkeypatch):
-    """A stage that chatters would otherwise be sent more lines than it reads."""
+    """Without this limit a stage that reports damage without end would be sent more lines than it reads."""
     link, _ = connect()
     lines: list[bytes] = []
 
@@ -88,8 +88,10 @@ def test_a_line_that_always_arrives_damaged_is_sent_four_times(dry_stage, connec
 
 
 def test_waiting_for_a_lost_answer_leaves_time_for_a_stop():
-    """The thread that waits for an answer sends the stops, within half a second; a busy machine has 2 s to answer."""
+    """The thread that waits for an answer also sends the stops. A stop has to be sent within half a second."""
+    # One wait may take a third of that.
     assert stage.ANSWER_TIMEOUT_S <= 0.5 / 3
+    # A busy machine has 2 s to answer.
     assert stage.ANSWER_TIMEOUT_S * stage.TRIES >= 2.0
 
 

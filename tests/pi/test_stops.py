@@ -196,7 +196,7 @@ def test_a_full_queue_of_the_journal_loses_no_reply(pi, stage):
 
 
 def test_events_beyond_the_queue_of_a_hanging_disk_are_dropped_with_one_error(tmp_path):
-    """They must not fill the memory."""
+    """Events that wait must not fill the memory."""
     journal = journals.JournalThread(journals.Journal(tmp_path))
     errors: list[Any] = []
     for _ in range(journals.JOBS_WAITING + journals.EVENTS_WAITING + 10):
@@ -294,7 +294,7 @@ def test_subscribers_that_disconnect_together_delay_no_command(
                 left_s = min(left_s, time.monotonic())
     record_testsuite_property("longest_answer_to_alive_ms", longest_s * 1e3)
     assert leaving.returncode == 0
-    # 0.1 s is chosen: a quarter of the time for which a host of 100 ms may be silent.
+    # 0.1 s is a quarter of the time for which a host with a heartbeat of 100 ms may be silent.
     assert longest_s < (0.1 if is_campaign else HANG_S)
 
 

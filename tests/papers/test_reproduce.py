@@ -58,7 +58,7 @@ def test_every_figure_is_stamped_as_simulated(monkeypatch, tmp_path):
     assert stamps == ["SIMULATED"]
 
 
-def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_missing(tmp_path, monkeypatch):
+def test_the_page_loads_no_other_file_says_that_all_is_simulated_and_names_missing_items(tmp_path, monkeypatch):
     def fail(_):
         raise DataError("no such image", "it was not made")
 
@@ -75,23 +75,27 @@ def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_
     assert "could not be made" in page
     assert "no such image" in page
     assert "Not made in this run: fig21" in page
-    missing = page.split("not reproduced yet:")[1].split("</p>")[0]
+    _, after_heading = page.split("not reproduced yet:")
+    missing_items, *_ = after_heading.split("</p>")
     for key in set(report.TITLES) - set(makers):
-        assert key in missing
+        assert key in missing_items
 
 
-def test_an_interrupted_run_has_a_page_and_the_next_run_names_the_items_of_it_that_its_own_page_lacks(
-    tmp_path, monkeypatch, capsys
-):
-    def interrupt(_):
-        raise KeyboardInterrupt
+def interrupt(_):
+    raise KeyboardInterrupt
 
+
+def test_an_interrupted_run_writes_a_page_with_the_items_made_before(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "MAKERS", {"fig3": lambda _: make_item(), "fig20": interrupt})
     assert main(["reproduce", "--out", str(tmp_path)]) == INTERRUPTED
     page = (tmp_path / "reproduce.html").read_text(encoding="utf-8")
     assert 'id="fig3"' in page
     assert "Not made in this run: fig20" in page
 
+
+def test_a_run_names_items_of_an_earlier_run_that_are_not_on_its_page(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(report, "MAKERS", {"fig3": lambda _: make_item(), "fig20": interrupt})
+    assert main(["reproduce", "--out", str(tmp_path)]) == INTERRUPTED
     monkeypatch.setattr(report, "MAKERS", {"fig21": lambda _: make_item("fig21")})
     capsys.readouterr()
     assert main(["reproduce", "--out", str(tmp_path)]) == 0

@@ -100,7 +100,8 @@ def test_phases_are_drawn_within_half_a_circle_of_the_middle(monkeypatch, limits
     drawn_deg = np.asarray(image.get_array())
     middle_deg = sum(limits) / 2
     assert unit == "degrees"
-    assert (abs(drawn_deg - middle_deg) <= 180).all()
+    half_a_circle_deg = 180
+    assert (abs(drawn_deg - middle_deg) <= half_a_circle_deg).all()
     assert np.allclose(np.exp(1j * np.radians(drawn_deg)), np.exp(1j * np.radians(phases_deg)))
     assert image.get_clim() == limits
     # Without limits the phases are drawn as they are.

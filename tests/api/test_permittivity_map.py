@@ -27,7 +27,7 @@ LEAKAGE_V = -0.03 + 0.06j
 # True permittivities of six pixels, from plastics to glass and stone.
 TRUE_EPS = np.array([[2.05 - 0.005j, 2.6 - 0.01j, 3.78 - 0.7j], [4.75 - 2.43j, 6.3 - 0.2j, 11.0 - 0.4j]])
 # Number of the patch of PET; the patch of copper is 1.
-PET = 2
+PET_PATCH = 2
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +98,9 @@ def test_the_mean_of_the_map_over_a_patch_is_the_patch_s_permittivity(scan):
     patches = scan.patches()
     # The patch of copper has no permittivity.
     has_permittivity = np.isfinite(patches["permittivity"].values)
-    assert patches["patch"].values[has_permittivity].tolist() == [PET]
-    pet = patches.sel(patch=PET)
-    inside = (patches["label"] == PET) & patches["interior"]
+    assert patches["patch"].values[has_permittivity].tolist() == [PET_PATCH]
+    pet = patches.sel(patch=PET_PATCH)
+    inside = (patches["label"] == PET_PATCH) & patches["interior"]
     difference = complex(eps["permittivity"].where(inside).mean()) - complex(pet["permittivity"])
     # Measured: 2 % of a standard error in the real part, 9 % in the loss.
     assert abs(difference.real) < 0.5 * float(pet["permittivity_real_standard_error"])
@@ -110,10 +110,10 @@ def test_the_mean_of_the_map_over_a_patch_is_the_patch_s_permittivity(scan):
 def test_no_pixel_is_more_certain_than_its_patch(scan):
     eps = scan.permittivity_map()
     patches = scan.patches()
-    is_pet = patches["label"].values == PET
+    is_pet = patches["label"].values == PET_PATCH
     for part in ("real", "loss"):
         name = f"permittivity_{part}_standard_error"
-        error_of_patch = float(patches[name].sel(patch=PET))
+        error_of_patch = float(patches[name].sel(patch=PET_PATCH))
         assert np.nanmin(eps[name].values[is_pet]) >= error_of_patch * (1 - 1e-6)
 
 
@@ -175,8 +175,8 @@ def test_probe_returns_the_results_of_a_pixel_and_of_its_patch(scan):
     eps = scan.permittivity_map()["permittivity"].sel(x_mm=x_mm, y_mm=y_mm, method="nearest")
     pixel = scan.probe(x_mm, y_mm)
     assert complex(pixel["permittivity"]) == complex(eps)
-    assert int(pixel["label"]) == PET
-    assert pixel["name"].item() == scan.materials()["name"].sel(patch=PET).item()
+    assert int(pixel["label"]) == PET_PATCH
+    assert pixel["name"].item() == scan.materials()["name"].sel(patch=PET_PATCH).item()
     beside_the_plates = scan.probe(0, 45)
     assert beside_the_plates["name"].item() == ""
 

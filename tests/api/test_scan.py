@@ -149,6 +149,7 @@ def test_sub_bands_are_a_dimension_of_the_patches(folder):
 def test_each_pixel_can_have_its_own_incidence_angle(folder):
     angles = open_scan(folder, incidence="pixel").image()["incidence_deg"]
     assert angles.dims == ("y_mm", "x_mm")
+    # Measured: 54.88 degrees in every pixel.
     assert abs(angles - INCIDENCE_DEG).max() < 10
 
 

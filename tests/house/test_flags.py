@@ -1,7 +1,7 @@
 """Flags in the source that have the same value in every call or class: `frozen`, `strict`, `daemon` and others.
 
-They decide that nobody changes a record that was passed to him, that `zip` drops no items, that no thread keeps a
-program from ending, and that no file from outside is unpickled. Few tests would notice a single wrong flag.
+With these values a function cannot change a record that was passed to it, `zip` drops no items, no thread keeps a
+program from ending, and no file from outside is unpickled. Few other tests would notice a single wrong flag.
 """
 
 from __future__ import annotations

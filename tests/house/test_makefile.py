@@ -15,7 +15,7 @@ PROJECTS = ("shared", "pi_controller", "simulators", "host", "papers", "worlds")
 
 @pytest.fixture
 def make(tmp_path: Path):
-    """A function that runs `make` beside a Python environment, in a folder with a space in its name (`make.folder`).
+    """A function that runs `make` in a folder with a space in its name (`make.folder`), which has an environment.
 
     It returns make's exit status and its output. With the option `-n` make only prints the commands.
     """

@@ -404,7 +404,7 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
         with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path / file_name):
             ServerAddress(certificate=tmp_path / file_name, key=tmp_path / file_name).check()
     place = ServerAddress(port=0, certificate=tmp_path / "certificate.pem", key=tmp_path / "key.pem")
-    with serve_folder(scans, access=Access(TOKEN, control=True, secure=True), place=place) as view:
+    with serve_folder(scans, access=Access(TOKEN, control=True, secure=True), server_address=place) as view:
         trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
         with urlopen(f"https://127.0.0.1:{view.port}/api/scans", timeout=HANG_S, context=trusted) as reply:
             assert json.load(reply)["scans"]

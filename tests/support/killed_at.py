@@ -44,9 +44,9 @@ def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
 
 def main(words: list[str]) -> int:
     """Run `polysight` or `polysight-pi` with the remaining arguments."""
-    hits, places, program, *arguments = words
-    for place in places.split(","):
-        operation, suffix, nth = place.split(":")
+    hits, operations, program, *arguments = words
+    for operation_text in operations.split(","):
+        operation, suffix, nth = operation_text.split(":")
         kill_at(Path(hits), operation, suffix, int(nth))
     sys.argv = [str(Path(sys.executable).with_name(program)), *arguments]
     if program == "polysight":

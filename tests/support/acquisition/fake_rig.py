@@ -304,10 +304,10 @@ class FakeRig:
 
 
 def make_small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits: float) -> Instrument:
-    """The published rig with a small grid and few pulses, on a loopback subnet that is free.
+    """The published rig with a small grid and few pulses, on a free loopback subnet.
 
-    Each of the three attempts of a command waits for its reply as long as `HANG_S`. The other limits and the receive
-    buffer are chosen: short or small enough for a test, and independent of this machine's disk.
+    Each of the three attempts of a command waits for its reply as long as `HANG_S`. Other limits are short, the receive
+    buffer is small, and no free space is needed on the disk.
     """
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 3 * HANG_S, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}

@@ -91,13 +91,18 @@ class Served:
     """
 
     def __init__(
-        self, site: Site, access: Access, host: str = "127.0.0.1", port: int = 0, place: ServerAddress | None = None
+        self,
+        site: Site,
+        access: Access,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        server_address: ServerAddress | None = None,
     ) -> None:
         self.site = site
         starts = site.starts and access.control
         stage = StageControl(site.config) if starts else None
         front = Front(site.scans, access, starts, make_reader_app(site), stage)
-        self._server = make_server(front, place or ServerAddress())
+        self._server = make_server(front, server_address or ServerAddress())
         site.is_ending = lambda: self._server.should_exit
         self._server.config.host = host
         self._server.config.port = port
@@ -132,12 +137,12 @@ def serve_folder(
     token: str = "",
     access: Access | None = None,
     config: Path | None = None,
-    place: ServerAddress | None = None,
+    server_address: ServerAddress | None = None,
 ) -> Iterator[Served]:
     """Serve all scans in a folder during the block. With a rig file (`config`) the page can start programs."""
     access = access or Access(token, control=bool(token))
     programs = Programs() if config is not None else None
-    server = Served(Site(Scans(root), Watches(access.control), programs, config), access, place=place)
+    server = Served(Site(Scans(root), Watches(access.control), programs, config), access, server_address=server_address)
     try:
         yield server
     finally:

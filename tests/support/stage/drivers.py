@@ -356,7 +356,7 @@ class PortDriver(Driver):
         pytest.skip(f"a hand on the motors is needed ({dx}, {dy} steps)")
 
     def reset(self) -> None:
-        """Opening the port again does it (a board by DTR, a pseudo terminal by itself)."""
+        """Open the port again: that resets a board by the line DTR, and a simulated stage at a pseudo terminal."""
         self._port.close()
         self.received = self._partial = self._sent = b""
         self._port.open()

@@ -184,20 +184,20 @@ def level(images: Images, segmentation: Segmentation, tilts: Tilts | None = None
 
 
 BEHIND_PATCH = 0.6
-"""Background in a plate over that beside the plates: of tables in scenes of the independent generator. It is less than
-1: what changes plates and metal alike cancels in their ratio, and a table is brightest at its own edges."""
+"""Background in a plate divided by that next to the plates: of tables in scenes of the independent generator. It is
+less than 1: changes of plates and metal alike cancel in their ratio, and a table is brightest at its own edges."""
 UNEVEN_METAL_SHARE = 0.5
-"""Error of each part of the metal's ln(V / H), as a share of the distance between its value by root mean squares and by
-the median of pixels: where metal lies at the end of the scan neither is right (`benchmarks coverage`)."""
+"""Error of each part of the metal's ln(V / H), as a share of the difference between its value by root mean squares and
+by the median of pixels: where metal lies at the end of the scan neither is right (`benchmarks coverage`)."""
 HALO_OF_METAL = 4.0
 HALO_OF_PATCH = 3.0
 """Error of the metal's V / H, and of V on a plate, relative to the halo of V (light beside the patches) around them: in
 scenes of an independent generator where 10 to 50 % of the largest amplitude were clipped."""
 UNEVEN_AT_END = 0.01
-"""Error of ln|V / H| by the aperture's end above which a plate's slopes are not those of the whole scan; chosen."""
+"""Error of ln|V / H| near the aperture's end above which a plate's slopes are not used for the whole scan; chosen."""
 ANGLE_BY_APART = 1.0
-"""Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place turn it
-by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
+"""Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place change
+it by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
 RAISED_RAD_PER_M = 1.1
 """Error of the phase of V / H per metre between the planes of a plate and of the metal: an error d of the difference
 between the angles of both boards changes it by 2 k sin(theta) d; 0.4 mrad: places of boards are wrong by about half a
@@ -205,7 +205,7 @@ millimetre where the images of H and V lie on each other (chosen)."""
 FILLED_LEVEL = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material; chosen."""
 POSSIBLE_SIGN = 0.05
-"""If the other sign of the phases is likelier than this (chosen), an undeclared metal has to pass with it, too."""
+"""If the other sign of the phases is likelier than this (chosen), an undeclared metal must be metal with it, too."""
 
 
 def analyse(

@@ -1,7 +1,8 @@
-"""Weak copies of the plates beside them: the mark of a second path beside the direct path.
+"""Find weak copies of plates in the images, which are a sign of a second path besides the direct path.
 
-Samples are divided by the direct path. A second path beside it makes fringes over the scan, and fringes copy the whole
-image: shifted, and weaker by the second path's share, in each channel to its own place.
+Samples are divided by the direct path. A second path in addition to it makes fringes over the scan, and fringes add a
+copy of the whole image: displaced, and weaker by the ratio of the second path to the direct path. The displacement
+differs between H and V.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ WEAK_DB = -12.0
 WEAKEST_DB = -30.0
 """Levels of copies relative to the brightest plate: shares of a quarter to a thirtieth; chosen."""
 LEAST_OVERLAP = 0.6
-"""Least share of a copy that a shifted plate covers, and of the shifted plates that copies cover; chosen."""
+"""Least share of a copy's pixels that shifted plates cover, and of the shifted plates' pixels that copies cover;
+chosen."""
 SAME_DB = 3.0
 """Largest deviation of a copy's level from the others', relative to its plate; chosen."""
 VISIBLE_AMPLITUDE = 0.06
@@ -58,9 +60,8 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
 def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pixel_mm: float) -> bool:
     """Return true if the patches taken for copies in one channel are weak plates, by the evidence of the other channel.
 
-    A plate stands at one place in both channels, while a second path copies each channel to a place of its own. So they
-    are plates if `other`, float [ny, nx], the amplitude of the other channel, shows all of them, unless some of them
-    are found to be copies there too.
+    A plate is at the same place in both channels, a copy is not. So they are plates if `other`, float [ny, nx], the
+    amplitude of the other channel, shows all of them, unless some of them are found to be copies there, too.
     """
     brightest = max(float(np.median(other[p.mask])) for p in patches)
     visible_patches = [
@@ -117,7 +118,7 @@ def _find_copies_at_shift(
     observed = np.logical_or.reduce([p.mask for p in weak])
     if not expected.any() or float((expected & observed).sum()) < LEAST_OVERLAP * float(expected.sum()):
         return None
-    # The image shifted onto its copy: a patch's level is relative to the plate that it would be the copy of.
+    # The image shifted onto its copy gives the level of each patch relative to the plate of which it may be a copy.
     shifted = np.asarray(scipy.ndimage.shift(amplitude, shift_px, order=0))
     levels_db = {}
     for patch in weak:

@@ -206,6 +206,7 @@ class ErrorDiscriminant(Model):
         differences = self._select_channels(relative(log_h, self._anchor_t[:, None] - self._anchor_t, self._anchor_t))
         patch_covariance = self._patch_covariances(self.pixels) + self.scan
         inverse = np.linalg.inv((patch_covariance[:, None] + patch_covariance) / 2)
+        # Axes are a and b material, d and e feature.
         return np.sqrt(np.einsum("abd,abde,abe->ab", differences, inverse, differences))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:

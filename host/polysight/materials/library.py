@@ -26,7 +26,7 @@ from polysight_shared.errors import DataError, ErrorCode, quote
 from polysight_shared.files import write_atomically
 
 FORMAT = "polysight-library-1"
-"""Name of the file's format; a file of another one is refused."""
+"""Name of the file's format; files of other formats are refused."""
 SAME_ANGLE_DEG = 1.0
 """Incidence angles that differ by no more count as one: |P| changes by some 10 % in a degree."""
 SIMULATED_LIBRARY = Path(__file__).with_name("simulated-library.npz")
@@ -84,8 +84,8 @@ class Library:
     entries
         The patches.
     fit
-        {"angles": {"55": fit of that angle, "55+60": fit of both together}}, each of `train.fit_samples`; that fit
-        alone in the part of one angle (`at_angle`); empty if none was fitted.
+        {"angles": {"55": fit of that angle, "55+60": fit of both together}}, each a result of `train.fit_samples`. In
+        the library of one angle (`at_angle`) it is the fit itself. Empty if none was fitted.
     note
         A sentence on its origin, for reports; may be empty.
     """

@@ -1,11 +1,11 @@
 """Half spaces as seen by the rig, and the effect of differences between specimens.
 
 Two plates of the same material differ by some per cent in the real part of the permittivity and by tens of per cent in
-the loss (Fig. 17 of the POLySIGHT paper). `(ln eps', ln eps'')` is assumed to be normal; Eq. 2 of the paper, Fresnel's
-coefficients, converts its spread to correlated errors of ln|H|, ln|V| and arg P (P = H / V), relative to metal, for all
-angles together because they show the same specimen.
+the loss (Fig. 17 of the POLySIGHT paper). A specimen deviates from its material by s = (d ln eps', d ln eps''), which
+is assumed to be normal. Eq. 2 of the paper, Fresnel's coefficients, gives the matrix F that converts s to deviations
+F s of ln|H|, ln|V| and arg P (P = H / V), relative to metal. F has rows for all angles, as they show the same specimen.
 
-Thresholds near metal and the scale `SOFT_RATIO` are chosen.
+The thresholds near metal and the scale `SOFT_RATIO` are chosen.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ PUBLISHED_SPREAD = (0.027, 0.19)
 """Standard deviations of ln eps' and ln eps'' if a library has no estimate: root mean square of PET's and ceramic's in
 Fig. 17 of the paper (variances 0.0021 and 0.0295 of 3.78 and 4.75; 0.0255 and 0.1081 of 0.70 and 2.43)."""
 PRIOR_FREEDOM = 4.0
-"""Weight of that prior, in number of specimens."""
+"""Weight of `PUBLISHED_SPREAD` in the spread of all materials together, as a number of specimens. Chosen, as the next
+one: libraries have few specimens of a material."""
 OWN_FREEDOM = 20.0
-"""Weight of the mean of all materials in one material's own spread, in number of specimens. Both weights are chosen:
-libraries have few specimens of a material."""
+"""Weight of the spread of all materials together in that of a single material, as a number of specimens."""
 METAL_WITHOUT_PERMITTIVITY = 0.25
 """|P - 1| or |1/P - 1|, the smaller, below which a patch gets no permittivity.
 
@@ -35,11 +35,12 @@ A relative error d of P changes eps by about 4 d / |P - 1/P|: at 0.25 the usual 
 permittivity, and the error grows without bound towards P = 1.
 """
 METAL_WITHOUT_BRIGHTNESS = 0.25
-"""Measured |V/H - 1| below which |H| says nothing about leakage: metal has |H| = 1 with any leakage."""
+"""Measured |V/H - 1| below which |H| is not used to estimate leakage: metal has |H| = 1 with any leakage."""
 METAL_WITHOUT_ERROR = 0.25
 """Median |V/H - 1| of a patch below which it has no error of its own, and gives no information on common errors."""
 METAL_UNLIKE = 0.2
-"""|V/H - 1| above which a patch is evidence for the metal beside it; metal looks like water beside water."""
+"""|V/H - 1| above which a patch is evidence that its reference is metal: water relative to water looks like metal
+relative to metal."""
 METAL_SPECIMENS = 0.1
 """|V/H - 1| below which a material is metal, whose specimens do not differ."""
 SOFT_RATIO = 0.05
@@ -95,7 +96,7 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
     """Return the permittivity of the half space of t = V / H [angles]: mean of Eq. 3 over the angles, made passive."""
     eps = complex(np.mean([complex(permittivity_from_ratio(q, angle)) for q, angle in zip(t, angles_rad, strict=True)]))
-    # Above that of vacuum, 1, where nothing would be reflected.
+    # At least 1.01: a half space of 1 would reflect nothing.
     return complex(max(eps.real, 1.01), min(eps.imag, -_LEAST_LOSS))
 
 
@@ -119,7 +120,7 @@ def fit_spread(
 
     Return the variances of ln eps' and ln eps'' of each material, [materials, 2], and the covariance of placements,
     [d, d]. The spread is that of all materials together, with the published spread as prior, corrected by each
-    material's own. A material with a single specimen says nothing about it, but its patches count for the placements.
+    material's own. A material with a single specimen shows no spread, but its patches count for the placements.
     """
     is_single = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
     has_spread = ~is_single & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)
@@ -135,7 +136,8 @@ def fit_spread(
     placement = noise
     second_moments = np.zeros((patches_of_specimen.size, 2))
     for _ in range(_ROUNDS):
-        # Expectation: deviation of each specimen given its patches, normal with this mean and covariance.
+        # Expectation: deviation s of each specimen given its patches, normal with this mean and covariance. Axes are
+        # g specimen, a and b the two components of s, d and e feature.
         information = effect_of_specimen.mT @ np.linalg.inv(placement + _compute_floor(noise))
         posterior = np.linalg.inv(
             np.diag(1 / pooled) + patches_of_specimen[:, None, None] * (information @ effect_of_specimen)

@@ -201,8 +201,8 @@ def test_a_random_wall_has_no_permittivity_or_that_of_its_medium(metal, gains, o
     learnt = gains(optics)
     # Every fourth point, for speed
     voltages = find_voltages(metal[np.arange(0, len(metal), 4)], optics)
-    flat = 0 * voltages.bend_inside
-    voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
+    flat = 0 * voltages.curvature_inside
+    voltages = replace(voltages, curvature_inside=flat, curvature_across=flat, twist=flat)
     gain = find_gains(learnt, voltages)
     plane = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=None)
     rng = np.random.default_rng(7)
@@ -288,8 +288,8 @@ def rippled_plane(metal, gains, optics):
     """
     learnt = gains(optics)
     voltages = find_voltages(metal, optics)
-    flat = 0 * voltages.bend_inside
-    voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
+    flat = 0 * voltages.curvature_inside
+    voltages = replace(voltages, curvature_inside=flat, curvature_across=flat, twist=flat)
     expected = predict_voltages(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
     received = find_gains(learnt, voltages) * expected
     low = voltages.at_m.min(axis=0)

@@ -60,7 +60,7 @@ class Voltages:
         cent near Brewster's angle.
     path_m
         Path from TX over the point to H and V, [n, 2].
-    bend_inside, bend_across, twist
+    curvature_inside, curvature_across, twist
         The surface's curvatures in the plane of incidence and across it, and the twist between both, [n], 1 / m.
     arrival, departure
         Directions in which V sees the point, and in which TX sees it for H: x and y of unit vectors, [n, 2].
@@ -75,8 +75,8 @@ class Voltages:
     response: Complex
     theta: Array
     path_m: Array
-    bend_inside: Array
-    bend_across: Array
+    curvature_inside: Array
+    curvature_across: Array
     twist: Array
     arrival: Array
     departure: Array
@@ -118,15 +118,15 @@ def find_voltages(seen: SeenEchoes, optics: Optics, shape: Shape | None = None) 
         paths.append(path)
     _, arrival_leg, *_ = compute_unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
     departure_leg, *_ = compute_unit_legs(shape.points, seen_from["h"], tx_m, optics.h.at_m)
-    bend_inside, bend_across, twist = resolve_curvature(*surface, seen.h.at_m, tx_m)
+    curvature_inside, curvature_across, twist = resolve_curvature(*surface, seen.h.at_m, tx_m)
     return Voltages(
         voltage=np.stack(voltages, axis=1),
         std=np.stack(std, axis=1),
         response=np.stack(rows, axis=1),
         theta=np.stack(theta, axis=1),
         path_m=np.stack(paths, axis=1),
-        bend_inside=bend_inside,
-        bend_across=bend_across,
+        curvature_inside=curvature_inside,
+        curvature_across=curvature_across,
         twist=twist,
         arrival=arrival_leg[:, :2],
         departure=departure_leg[:, :2],
@@ -139,7 +139,7 @@ def reflect_points(eps: NDArray | complex, points: Voltages, wave_number: float)
     """Return the coefficients r_s, r_p, r_sp and r_ps of the curved surface at each point for H and V, [n, 2, 4]."""
     eps_of_receivers = np.asarray(eps)[..., None]
     r_s, r_p = reflect_curved(
-        eps_of_receivers, points.theta, points.bend_inside[:, None], points.bend_across[:, None], wave_number
+        eps_of_receivers, points.theta, points.curvature_inside[:, None], points.curvature_across[:, None], wave_number
     )
     mixed = mix_twisted(eps_of_receivers, points.theta, points.twist[:, None], wave_number)
     # The antennas are near: a spherical wave is not reflected quite like a plane one.
@@ -158,8 +158,8 @@ def compute_expansion_parameter(points: Voltages, wave_number: float) -> Array:
     Each order of the expansion is about this times the one before. K is the mean of both curvatures' magnitudes, k the
     wave number.
     """
-    bend = (np.abs(points.bend_inside) + np.abs(points.bend_across)) / 2
-    return bend / (wave_number * np.cos(points.theta[:, 0]) ** 3)
+    curvature = (np.abs(points.curvature_inside) + np.abs(points.curvature_across)) / 2
+    return curvature / (wave_number * np.cos(points.theta[:, 0]) ** 3)
 
 
 def number_blocks(at_m: Array, shift: tuple[float, float], block_m: float = BLOCK_M) -> NDArray[np.int_]:

@@ -248,25 +248,25 @@ def reflect_flat(eps: NDArray | complex, theta: Array) -> tuple[Complex, Complex
 
 
 def reflect_curved(
-    eps: NDArray | complex, theta: Array, bend_inside: Array, bend_across: Array, wave_number: float
+    eps: NDArray | complex, theta: Array, curvature_inside: Array, curvature_across: Array, wave_number: float
 ) -> tuple[Complex, Complex]:
     """Return coefficients (r_s, r_p) [n] at a curved surface, to first order in curvature / wave number.
 
-    `eps` is the permittivity, infinite for metal, `theta` the incidence angle in radians. `bend_inside`, `bend_across`:
-    curvature (1 / m, convex positive) in the plane of incidence and across it.
+    `eps` is the permittivity, infinite for metal, `theta` the incidence angle in radians. `curvature_inside` is the
+    curvature in the plane of incidence, `curvature_across` that across it, 1 / m, positive for convex bodies.
     """
-    bends = (bend_inside, bend_across)
-    single_wave = _reflect_local(eps, theta, bends, wave_number)
+    curvatures = (curvature_inside, curvature_across)
+    single_wave = _reflect_local(eps, theta, curvatures, wave_number)
     # The derivatives r' and r'' by the angle are those of flat surfaces for dielectrics: the next order of all other
     # terms is missing, too, and so the result is closer to the exact series. Flat metal has -1 at every angle, without
     # derivatives; there those of the curved surface are taken (2 % of V of a sphere of 50 mm).
     is_metal = bool(np.any(np.isinf(eps)))
-    bends_of_derivatives = bends
+    curvatures_of_derivatives = curvatures
     if not is_metal:
-        bends_of_derivatives = (0 * bend_inside, 0 * bend_across)
-    middle = _reflect_local(eps, theta, bends_of_derivatives, wave_number)
-    above = _reflect_local(eps, theta + ANGLE_STEP, bends_of_derivatives, wave_number)
-    below = _reflect_local(eps, theta - ANGLE_STEP, bends_of_derivatives, wave_number)
+        curvatures_of_derivatives = (0 * curvature_inside, 0 * curvature_across)
+    middle = _reflect_local(eps, theta, curvatures_of_derivatives, wave_number)
+    above = _reflect_local(eps, theta + ANGLE_STEP, curvatures_of_derivatives, wave_number)
+    below = _reflect_local(eps, theta - ANGLE_STEP, curvatures_of_derivatives, wave_number)
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []
@@ -276,8 +276,8 @@ def reflect_curved(
     for local, r, other, up, down in zip(single_wave, middle, middle[::-1], above, below, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
-        change_inside = 1j * bend_inside / (4 * wave_number * cos) * second
-        change_across = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
+        change_inside = 1j * curvature_inside / (4 * wave_number * cos) * second
+        change_across = 1j * curvature_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
         coefficients.append(local + change_inside + change_across)
     return coefficients[0], coefficients[1]
 
@@ -330,21 +330,21 @@ def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number:
 
 
 def _reflect_local(
-    eps: NDArray | complex, theta: Array, bends: tuple[Array, Array], wave_number: float
+    eps: NDArray | complex, theta: Array, curvatures: tuple[Array, Array], wave_number: float
 ) -> tuple[Complex, Complex]:
     """Return coefficients (r_s, r_p) [n] of a single cylindrical wave, without the sum over directions.
 
-    `bends` are the curvatures in the plane of incidence and across it, 1 / m. To first order each changes the flat
+    `curvatures` are those in the plane of incidence and across it, 1 / m. To first order each changes the flat
     coefficients as if it were alone, so that the result is r(inside) + r(across) - r(flat).
     """
-    bend_inside, bend_across = bends
+    curvature_inside, curvature_across = curvatures
     cos = np.cos(theta)
     sin = np.sin(theta)
     if np.any(np.isinf(eps)):
         # On metal the field along a cylinder's axis vanishes, or its derivative: curvature in the plane of incidence
         # does not change r_s, and curvature across it does not change r_p.
-        turn_p = bend_inside / (wave_number * cos**3)
-        turn_s = bend_across / (wave_number * cos)
+        turn_p = curvature_inside / (wave_number * cos**3)
+        turn_s = curvature_across / (wave_number * cos)
         return -np.exp(1j * turn_s), -np.exp(1j * turn_p)
     eps = np.asarray(eps, complex)
     root = np.sqrt(eps)
@@ -354,8 +354,8 @@ def _reflect_local(
     # Curvature in the plane of incidence: a cylinder whose axis is across that plane. `into`, `out` and `inside_term`
     # are logarithmic derivatives along the normal, over k, of the waves in air towards the surface and away from it,
     # and of the wave in the medium. `outer` and `inner` are their changes by the curvature, in air and in the medium.
-    outer = bend_inside / (2 * wave_number * cos**2)
-    inner = bend_inside / (2 * wave_number * cos_medium**2)
+    outer = curvature_inside / (2 * wave_number * cos**2)
+    inner = curvature_inside / (2 * wave_number * cos_medium**2)
     into = 1j * cos - outer
     out = -1j * cos - outer
     inside_term = 1j * root * cos_medium - inner
@@ -366,8 +366,8 @@ def _reflect_local(
     # axis into those around it.
     k_out = cos
     k_in = root * cos_medium
-    outer = bend_across / (2 * wave_number * k_out)
-    inner = bend_across / (2 * wave_number * k_in)
+    outer = curvature_across / (2 * wave_number * k_out)
+    inner = curvature_across / (2 * wave_number * k_in)
     into = (1j - outer) / k_out
     out = (-1j - outer) / k_out
     inside_term = (1j - inner) / k_in

@@ -57,7 +57,7 @@ POINTS = "surface.ply"
 # (tests/surfaces).
 MIN_RADIUS_M = 0.040
 # A surface with a smaller curvature, 1 / m, counts as flat: a radius of 2 m.
-FLAT_BEND = 0.5
+FLAT_CURVATURE = 0.5
 # Least number of points away from the edges to which a permittivity is fitted; chosen. (`LEAST_POINTS` is the least
 # number of points of a segment.)
 MIN_POINTS = 20
@@ -100,7 +100,7 @@ MOST_CANCELLED_STD_M = 0.02
 # Relative error of the curvature of a segment that no single medium explains: the error of the path of both faces' echo
 # differs from window to window. Chosen: of twelve surfaces of walls (1 to 20 mm, another author's exact series) nine
 # had at most 0.21, one 0.44; two were wrong by a factor of three, and their normals disagreed as far.
-WALL_BEND_ERROR = 0.25
+WALL_CURVATURE_ERROR = 0.25
 
 Array = NDArray[np.float64]
 
@@ -394,9 +394,9 @@ def doubt_places(
             unknown_m[members] = estimate_wall_std(
                 float(np.median(reflection[members])), float(np.median(rise[members]))
             )
-            judged[index] = add_bend_error(segment, WALL_BEND_ERROR)
+            judged[index] = add_curvature_error(segment, WALL_CURVATURE_ERROR)
         else:
-            judged[index] = add_bend_error(replace(segment, reason=BEHIND_ANOTHER_REASON), 1.0)
+            judged[index] = add_curvature_error(replace(segment, reason=BEHIND_ANOTHER_REASON), 1.0)
             # Standard deviation of a uniform distribution between this segment and the surface in front of it.
             unknown_m[members] = depth_m / np.sqrt(3)
     return judged, unknown_m
@@ -432,16 +432,17 @@ def describe_segment(number: int, shape: Shape) -> Segment:
     """Return a segment with its place, normal, radius and incidence angle by the shape of its points."""
     # The median over the points of each matrix element: noise drives the two principal curvatures of a point apart.
     usual_curvature = np.median(shape.curvature, axis=0)
-    bends, axes = np.linalg.eigh((usual_curvature + usual_curvature.T) / 2)
-    largest = int(np.abs(bends).argmax())
-    bend = float(np.abs(bends[largest]))
+    principal_curvatures, axes = np.linalg.eigh((usual_curvature + usual_curvature.T) / 2)
+    largest = int(np.abs(principal_curvatures).argmax())
+    signed_curvature = float(principal_curvatures[largest])
+    curvature = abs(signed_curvature)
     normal = shape.normals.mean(axis=0)
     normal /= np.linalg.norm(normal)
     radius_mm = None
     radius_std_mm = None
-    if bend > FLAT_BEND:
-        radius_mm = 1e3 / bend
-        radius_std_mm = radius_mm * estimate_bend_std(shape, axes[:, largest], float(bends[largest])) / bend
+    if curvature > FLAT_CURVATURE:
+        radius_mm = 1e3 / curvature
+        radius_std_mm = radius_mm * estimate_curvature_std(shape, axes[:, largest], signed_curvature) / curvature
     return Segment(
         number=number,
         points=len(shape.points),
@@ -453,26 +454,26 @@ def describe_segment(number: int, shape: Shape) -> Segment:
     )
 
 
-def estimate_bend_std(shape: Shape, axis: Array, bend: float) -> float:
-    """Return the standard error of a segment's curvature `bend`, 1 / m, along an `axis` [2] of its tangents.
+def estimate_curvature_std(shape: Shape, axis: Array, curvature: float) -> float:
+    """Return the standard error of a segment's `curvature`, 1 / m, along an `axis` [2] of its tangents.
 
-    `bend` follows from the second derivatives of the paths. The turn of the normals from point to point gives a second
-    value. Both agree for a surface of one medium; a wall or a second echo disturbs them differently. Their difference
-    and the scatter of the points' curvatures are added as squares. The scatter is not divided by the number of points,
-    because errors extend over many points.
+    `curvature` follows from the second derivatives of the paths. The turn of the normals from point to point gives a
+    second value. Both agree for a surface of one medium; a wall or a second echo disturbs them differently. Their
+    difference and the scatter of the points' curvatures are added as squares. The scatter is not divided by the number
+    of points, because errors extend over many points.
     """
-    bends = np.einsum("i,nij,j->n", axis, shape.curvature, axis)
-    low, high = np.percentile(bends, [16, 84])
+    curvature_of_points = np.einsum("i,nij,j->n", axis, shape.curvature, axis)
+    low, high = np.percentile(curvature_of_points, [16, 84])
     tangent = np.median(compute_tangents(shape.normals), axis=0)
     offset = (shape.points - shape.points.mean(axis=0)) @ tangent
     turned_normal = (shape.normals - shape.normals.mean(axis=0)) @ tangent @ axis
     axis_across = np.array([-axis[1], axis[0]])
     # Rotation of the normals per metre along the axis, and across it.
     rates = np.linalg.lstsq(np.stack([offset @ axis, offset @ axis_across], axis=1), turned_normal, rcond=None)[0]
-    return float(np.hypot((high - low) / 2, rates[0] - bend))
+    return float(np.hypot((high - low) / 2, rates[0] - curvature))
 
 
-def add_bend_error(segment: Segment, share: float) -> Segment:
+def add_curvature_error(segment: Segment, share: float) -> Segment:
     """Return a segment whose curvature has a further relative error of `share`."""
     if segment.radius_mm is None or segment.radius_std_mm is None:
         return segment

@@ -78,7 +78,7 @@ def test_a_sender_waits_until_its_command_is_obeyed(tmp_path):
 
 
 def test_an_empty_file_with_the_name_of_a_command_is_that_command(control):
-    """Such as one that `touch` makes in a shell."""
+    """`touch` in a shell makes such a file."""
     folder, stop = control
     (folder / CONTROL_FOLDER / "pause").touch()
     wait_for(lambda: stop.paused, "the pause")

@@ -78,7 +78,7 @@ def test_every_frame_of_a_short_row_is_at_its_pulse_or_masked(missed, load, seed
 
 @pytest.mark.parametrize("missed", [[5 * 16 + 7], [0], [ALL - 1], [79, 80], [*range(80, 96)]])
 def test_frames_are_kept_up_to_where_frames_and_packets_last_began_together(missed):
-    """That is every 91 frames. Nearer to the missed pulses it is not known which bytes the card has dropped."""
+    """They begin together at every 91st frame. Nearer to missed pulses it is unknown which bytes the card dropped."""
     results = [place_missed(missed, seed) for seed in range(5)]
     assert np.median([r.uncertain for r in results]) <= 2 * 91
     assert all("SYNC_IN" in describe(r, PULSES) for r in results)

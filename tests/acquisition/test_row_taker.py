@@ -87,7 +87,7 @@ class Bench:
         self.is_complete = True
         self.progress = Progress(row=ROW.index, take=TAKE, received=1, complete=False, last_arrival_ns=0)
         self.captures: dict[str, Any] = {}
-        # A pipe that is always readable: the taker's poll returns at once.
+        # A pipe that is always readable: the taker's poll returns immediately.
         read_end, write_end = os.pipe()
         os.write(write_end, b"x")
         self._pipe = (read_end, write_end)

@@ -247,7 +247,7 @@ def test_a_receive_buffer_below_two_bursts_ends_the_scan_before_it_begins(rig, t
 
 
 def test_frames_below_a_packet_end_the_scan_before_it_begins(rig, tmp_path):
-    """Of several frames in a packet, the times of all but one are unknown."""
+    """If a packet has several frames, the times of all but one are unknown."""
     chirp = msgspec.structs.replace(rig.instrument.chirp, samples=64, linear_samples=(0, 64))
     with expect_refusal(ErrorCode.VALUE_INVALID, "1024 bytes", "more samples"):
         run_scan(msgspec.structs.replace(rig.instrument, chirp=chirp), tmp_path / "s")

@@ -336,7 +336,7 @@ def test_when_processing_fails_it_is_reported_that_every_row_is_there(config, tm
 
 
 def test_a_complete_scan_succeeds_if_the_pi_run_cannot_be_ended(rig, tmp_path, monkeypatch):
-    """As with a full disk on the Pi: every row is committed, so nothing is missing."""
+    """The disk of the Pi may be full. Every row is committed, so nothing is missing."""
 
     def refuse_end(*_):
         raise DeviceError("the Pi did not write it down", "its disk is full", "remove old journals")

@@ -213,7 +213,7 @@ def test_a_scan_that_stops_now_waits_for_the_row_in_hand_and_processes_no_other(
     has_begun.wait()
     closing = threading.Thread(target=lambda: errors.append(queue.close(now=True)))
     closing.start()
-    # The others are given up at once.
+    # The other rows are given up immediately.
     while queue.rows_left > 1:
         closing.join(0.001)
     closing.join(0.03)

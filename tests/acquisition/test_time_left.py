@@ -94,7 +94,7 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
     assert [f["fact"] for f in load_facts(result.folder, "scan_paused")] == ["scan_paused"]
     after_rows = [report for report in reported if isinstance(report[0], int)]
     assert after_rows == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
-    # At the begin of the pause and at its end.
+    # At the beginning of the pause and at its end
     at_pause_s = [remaining_s for message, remaining_s in reported if isinstance(message, str)]
     assert at_pause_s == [2 * ROW_S] * 2
 

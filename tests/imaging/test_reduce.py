@@ -53,7 +53,7 @@ def test_few_frequencies_and_many_differ_by_less_than_1e_4_of_the_peak(rig):
 
 @given(st.floats(*GATE))
 def test_the_model_predicts_an_echo_after_the_gate(rig, echo_m):
-    """The model turns the echo at the few frequencies into what the gate makes of all samples."""
+    """The model turns the echo at the few frequencies into the result of the gate for all samples."""
     gate = reduction(rig.chirp, GATE)
     reduced = gate.matrix @ np.exp(2j * np.pi * _sweep(rig.chirp) * echo_m / C)
     predicted = gate.model @ np.exp(2j * np.pi * gate.frequencies_hz * echo_m / C)

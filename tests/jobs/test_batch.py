@@ -114,7 +114,7 @@ def test_a_failing_scan_stops_no_other_and_a_second_run_processes_unfinished_sca
 
 @pytest.mark.usefixtures("worker")
 def test_a_program_that_was_killed_after_its_mark_has_finished_its_scan(tmp_path):
-    """The mark is the last file that it writes."""
+    """The mark is the last file that the program writes."""
     make_scans(tmp_path / "in", "late")
     (job,) = make_jobs(tmp_path / "in", "late")
     assert many.run_scan(job).status == "done"
@@ -384,7 +384,10 @@ def test_the_real_program_processes_a_simulated_scan_and_refuses_a_damaged_one(t
     [('{"total_x": 5, "total_y": 7}', 35), ('{"total_x": 5}', 70_000), ("[", 70_000), (None, 70_000)],
 )
 def test_positions_are_those_of_the_settings_or_of_the_published_grid(content, positions, tmp_path):
-    """They decide how many scans are processed together. Faults of the settings are reported by the scan's program."""
+    """The number of positions decides how many scans are processed together.
+
+    Faults of the settings are reported by the scan's program.
+    """
     if content is not None:
         (tmp_path / "data_collection_cfg.json").write_text(content)
     assert batch._count_positions(tmp_path) == positions

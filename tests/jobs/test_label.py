@@ -1,4 +1,4 @@
-"""`polysight label`: boxes from options and from answers, what is written, and what is refused."""
+"""`polysight label`: boxes come from options or from answers; they are written, or refused with a reason."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The tests' browser ends with all its processes: one that stayed behind would take time from all later tests."""
+"""The tests' browser ends with all its processes: a process that remained would take time from all later tests."""
 
 import os
 import signal

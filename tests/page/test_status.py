@@ -25,7 +25,7 @@ RUNNING = PiState(heard_s=1.0, state="running", row=1, take=1)
 ROW = {"fact": "row_committed", "take": 2, "direction": 1, "pulses": 0, "boards": {}}
 REJECTED = {"fact": "row_rejected", "row": 1, "take": 1, "reasons": ["RV: no data"], "boards": {}}
 REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
-# Synchronisation of a good row; the phases are chosen.
+# Synchronisation of a good row: small residuals of phase
 GOOD_SYNC = RowSync(object_rad=0.02, direct_rad=0.004, masked=0)
 
 

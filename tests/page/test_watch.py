@@ -1,4 +1,4 @@
-"""The page's events describe the folder's content while it grows, for viewers that come early and late."""
+"""The page's events describe the content of a growing folder, also for viewers that come late."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ from polysight.store import manifest
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 
-# Time after which a program without a sign of life counts as ended; chosen so long that no test reaches it.
+# Time after which a program without a sign of life counts as ended: so long that no test reaches it
 NEVER_LAPSES_S = 1e6
 
 

@@ -376,7 +376,7 @@ def test_a_late_kernel_causes_no_width_fault_of_the_controller():
 
 
 def test_a_burst_can_be_stopped_only_before_it_begins():
-    """The controller sends a whole transfer: once, before it, the burst asks whether it is to stop."""
+    """The controller sends a whole transfer, so that a burst asks only once, before it, whether it must stop."""
     lines = Controller()
     questions = []
 
@@ -395,7 +395,7 @@ def test_a_burst_can_be_stopped_only_before_it_begins():
 def test_a_wrong_clock_is_a_fault(rate, fault):
     """A Pi's core clock changes where `core_freq` is not fixed, and with it the SPI clock.
 
-    At 1.6 times the clock the transfer is too short: periods are. At a fifth of it pulses last 5 us instead of 1 us.
+    At 1.6 times the clock the transfer and its periods are too short. At a fifth of it pulses last 5 us, not 1 us.
     """
     assert trigger.send_burst(Controller(rate), SPEC, 0).fault == fault
 
@@ -408,7 +408,7 @@ def test_a_burst_too_soon_after_the_one_before_is_not_sent():
 
 @pytest.fixture(params=["one-shot", "spi"])
 def instrument(instrument, request):
-    """The shipped wiring, and its alternative."""
+    """The rig with the shipped wiring (one-shot), and with its alternative (SPI)."""
     if request.param == "one-shot":
         return instrument
     return time_by_spi(instrument)
@@ -462,7 +462,7 @@ def test_pulses_beyond_one_transfer_are_sent_in_several(pi, record_rises, source
 # One pulse fewer on the return wire than were sent, one more, and none.
 @pytest.mark.parametrize("seen", [lambda n: n - 1, lambda n: n + 1, lambda _: 0])
 def test_other_pulses_on_the_return_wire_than_were_sent_are_a_fault(seen):
-    """Each burst is compared with it, so that a defective buffer or cable is found at the first point."""
+    """Each burst is compared with the return wire, so that a defective buffer or cable is found at the first point."""
     lines = FakeLines()
     lines.seen = seen
     posted = []

@@ -79,7 +79,7 @@ def test_a_rig_without_faults_gets_ok_for_each_check(on_chip, rig_with):
 def test_each_fault_of_the_chip_is_reported_by_its_check_and_the_others_go_on(
     on_chip, rig_with, settings, fault, name, words
 ):
-    """The check of the stage follows: its port does not exist either."""
+    """The check of the stage still runs: it reports that its port does not exist."""
     findings = on_chip(rig_with(**settings), fault, port="/dev/none")
     assert findings[name]["verdict"] == "fail"
     assert words in findings[name]["found"]
@@ -116,7 +116,7 @@ def test_a_wiring_that_the_service_refuses_is_an_error(rig_with, tmp_path, setti
 
 
 def test_one_pulse_in_a_thousand_that_is_too_long_is_an_error_without_a_one_shot():
-    """The radar takes at most 4 us (4,000 ns); a one-shot makes the width whatever the program does."""
+    """The radar takes at most 4 us (4,000 ns); a one-shot makes the width, which does not depend on the program."""
     assert "measured now" in str(judge_widths([3_000] * 1000, one_shot=False))
     finding = judge_widths([3_000] * 999 + [4_001], one_shot=False)
     assert isinstance(finding, Finding)

@@ -90,7 +90,7 @@ def test_an_interval_is_that_of_the_speed_within_one_percent(interval_ms, proble
 
 
 def test_after_a_hold_is_commanded_only_shorter_intervals_are_wrong_before_the_end():
-    """How long the stage rests is not known, so a longer interval is judged at the row's end."""
+    """The time for which the stage rests is not known, so that a longer interval is judged at the end of the row."""
     check, _ = note_edges(100.0)
     check.note_hold()
     assert check.note_edge(BEGIN_NS + 900 * MS) == ""
@@ -119,7 +119,10 @@ def test_an_edge_may_follow_the_status_that_counts_its_point_by_a_fifth_of_an_in
 
 
 def test_a_row_that_ends_too_soon_after_its_last_edge_is_a_fault():
-    """The stage needs its run-out for that, within one percent. Its report may come later: it is sent again if lost."""
+    """After its last edge the stage needs the time of its run-out, within one percent.
+
+    Its report may come later, since a lost one is sent again.
+    """
     points_s, end_s = MOTION.time_points([])
     run_out_ms = 1e3 * (end_s - points_s[-1])
     for share, is_wrong in ((1.0, False), (0.991, False), (0.989, True), (5.0, False)):

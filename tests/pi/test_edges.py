@@ -35,7 +35,7 @@ LINK_S = 0.001
 
 
 class Happening(NamedTuple):
-    """What the Pi gets: an edge of the trigger, a reply of the stage, or a command of the host."""
+    """An input of the Pi: an edge of the trigger, a reply of the stage, or a command of the host."""
 
     t_ns: int
     # "edge", the name of a command, or the reply.

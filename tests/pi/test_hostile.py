@@ -128,7 +128,7 @@ def stranger(pi):
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
 def test_a_message_with_an_impossible_value_is_refused(commands, field, impossible_value):
-    """By the decoder; `test_hostile_messages_disturb_nothing` shows it through the socket."""
+    """The decoder refuses it here; `test_hostile_messages_disturb_nothing` sends such messages through the socket."""
     for command in commands:
         for value in impossible_value:
             raw = msgpack.packb(msgspec.to_builtins(command) | {field: value})
@@ -163,7 +163,7 @@ def test_a_message_of_64_mb_is_not_taken_into_memory(pi, stranger):
 
 
 def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, request):
-    """Thousands of messages while rows run: each gets a reply, and every pulse is at its time."""
+    """Thousands of messages come while rows run. Each gets a reply, and every pulse is at its time."""
     amount = 100_000 if request.config.getoption("--long") else 2_000
     host: HostSide = pi.host
     rng = random.Random(amount)
@@ -400,7 +400,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
 
 
 def test_a_queue_that_never_empties_is_not_a_hang(pi, monkeypatch):
-    """The executor completes turns however many items wait: the watchdog and `Alive` depend on turns."""
+    """The executor completes its turns although items always wait: the watchdog and `Alive` depend on turns."""
     monkeypatch.setattr(executors, "TURN_TIMEOUT_S", 0.05)
     turns = itertools.count()
     monkeypatch.setattr(pi.service.executor, "_turned", lambda: next(turns))

@@ -170,7 +170,10 @@ def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, s
 
 
 def test_a_server_without_keys_is_not_reported_as_refusing_the_key_of_this_host(tmp_path, context):
-    """Either end may notice first: if the server does, it only disconnects, and the client connects again."""
+    """Either end may notice first that keys are missing.
+
+    If the server does, it only disconnects, and the client connects again.
+    """
     make_keys(tmp_path)
     rig = load_published_rig()
     replace = msgspec.structs.replace

@@ -41,7 +41,7 @@ def test_a_fresh_machine_has_no_fault_and_nothing_to_wait_for():
 
 @pytest.mark.parametrize("motion", ["homing", "row before its first point"])
 def test_a_reset_of_the_stage_whose_banner_was_lost_is_noticed_in_time(motion):
-    """The stage prints a banner when it starts; without it the reset shows in statuses: it is idle, not moving."""
+    """The stage prints a banner when it starts. Without it statuses show the reset: the stage is idle too early."""
     bench = Bench().begin_and_home()
     if motion == "homing":
         bench.machine.command("Home")
@@ -187,7 +187,7 @@ def test_a_host_that_falls_silent_ends_its_homing():
 
 
 def test_resume_is_sent_to_a_held_stage_only_when_it_rests():
-    """Then the place of the hold is known, and with it the times of the edges before and after it."""
+    """When the stage rests, the place of the hold is known, and with it the times of the edges before and after it."""
     bench = Bench().begin_and_home()
     bench.start()
     bench.machine.command("Hold")
@@ -265,7 +265,7 @@ def test_a_stage_at_rest_may_answer_late():
 
 @pytest.mark.parametrize("is_lasting", [True, False])
 def test_a_lost_trigger_line_or_edge_stops_the_motion_immediately(is_lasting):
-    """The trigger loop notices it within its look-up time, and the machine acts in the same turn.
+    """The trigger loop notices the loss within its look-up time, and the machine acts in the same turn.
 
     A lost edge is a fault of its row. A lost line lasts: no motion is accepted after it.
     """
@@ -539,7 +539,7 @@ def test_the_pi_accepts_a_raster_exactly_if_the_rig_file_is_accepted(columns, ro
 
 
 def test_the_host_forecasts_rows_with_the_run_up_of_the_pi():
-    """From rest to rest: the points and the run-up at both ends. A ramp takes v / a, for v^2 / 2a of way."""
+    """A row has its points and a run-up at both ends, from rest to rest. A ramp takes v / a, for a way of v^2 / 2a."""
     grid = RIG.grid
     stage = RIG.stage
     v = stage.speed_mm_s

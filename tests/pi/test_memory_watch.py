@@ -23,7 +23,7 @@ class Ended:
 
 
 class DrawnWatch(MemoryWatch):
-    """Uses `sizes` bytes at its checks, the last one then on; each cut finds two connections."""
+    """It uses `sizes` bytes at its checks, and the last size from then on; each cut finds two connections."""
 
     def __init__(self, sizes: list[int], waits: int, at_start: int = 0) -> None:
         self.sizes = [at_start, *sizes]

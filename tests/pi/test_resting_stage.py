@@ -1,4 +1,4 @@
-"""A stage that rests in a motion without having said how the motion ended, by its statuses alone."""
+"""A stage that rests in a motion without a report of the motion's end is noticed by its statuses alone."""
 
 import pytest
 from tests.support.pi.machine_bench import Bench

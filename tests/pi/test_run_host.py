@@ -252,7 +252,7 @@ def test_a_command_for_an_earlier_take_of_a_row_does_not_move_the_stage(host, st
 
 
 def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
-    """The journal has the earlier ones."""
+    """The journal has the earlier takes."""
     rig = set_stage_port(instrument, stage.port)
     for first_take in (1, 2):
         with closing(Running(rig, hub)) as running:

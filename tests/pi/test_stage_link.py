@@ -55,7 +55,7 @@ def test_the_link_waits_for_the_banner_and_then_greets_the_stage(dry_stage, conn
 
 
 def test_a_stage_without_banner_is_greeted_after_the_limit(dry_stage, connect):
-    """A stage whose port was open already does not restart, and so prints none."""
+    """A stage whose port was already open does not restart, and so prints no banner."""
     dry_stage.banner = False
     link, _ = connect(banner_timeout_s=0.05)
     assert link.request("SET", 1, 500).kind == "ok"

@@ -157,7 +157,7 @@ def test_after_a_pause_of_the_whole_program_the_fault_does_not_name_one_part_onl
 
 
 def test_a_command_of_a_run_is_accepted_only_when_its_event_is_on_the_disk(disk, pi):
-    """Begin a run, start a row, end the run; other commands are answered meanwhile."""
+    """These commands are: begin a run, start a row, end the run. Other commands are answered meanwhile."""
     host = pi.host
     commands: list[Any] = [host.make_begin(), m.RunRow(scan_id="scan", row_index=0, take=1)]
     commands.append(m.EndRun(scan_id="scan", exit_status="success"))
@@ -209,7 +209,7 @@ def test_events_beyond_the_queue_of_a_hanging_disk_are_dropped_with_one_error(tm
 
 
 def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
-    """Another thread requests the status, which is no sign of life of the executor: it ends that, and sends STOP."""
+    """Another thread requests the status, which is no sign of life of the executor: this ends, and STOP is sent."""
     monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
     host = pi.host
     host.must_accept(host.make_begin())
@@ -302,7 +302,7 @@ def test_subscribers_that_disconnect_together_delay_no_command(
 def test_whenever_the_disk_hangs_the_stage_is_stopped_in_time(
     disk, pi, stage, instrument, request, record_testsuite_property
 ):
-    """From the last heartbeat, or the command to abort, to STOP: within half a second, wherever the disk hangs.
+    """STOP is sent within half a second of the last heartbeat, or of the command to abort, wherever the disk hangs.
 
     In a third of the moments the stage's answer is lost, so that the row's command is sent again while it runs.
     """

@@ -17,7 +17,7 @@ from tests.support.rigs import load_published_rig, time_by_the_program
 from polysight_shared.config import Instrument
 from polysight_shared.tables import to_builtins
 
-# The program on the Pi. Limits are for an emulated processor on a busy computer, and chosen.
+# The program on the Pi, and time limits for an emulated processor on a busy computer
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
 INSTALL_LIMIT_S = 7200
 READY_LIMIT_S = 1800.0

@@ -1,6 +1,6 @@
 """A Raspberry Pi 3B in a box: Debian's kernel and its GPIO driver, the real installation, the emulated UNO on USB.
 
-`make test-pi` runs these and prints figures; docs/how-to/hardware-tests.md says what is real and what QEMU lacks.
+`make test-pi` runs these and prints figures; docs/how-to/hardware-tests.md lists what is emulated.
 The tests share one Pi and run in this order; each leaves the service running.
 """
 
@@ -24,7 +24,7 @@ from polysight_shared.sockets import HandshakeMonitor, create_requester
 SYNC_OUT = 22
 INPUT = 0
 OUTPUT = 1
-# Attempts of what a busy computer may delay too long; chosen.
+# Attempts of an action that a busy computer may delay too long
 TRIES = 5
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
@@ -196,7 +196,7 @@ def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
 
 
 def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed_host: HostSide):
-    """kill -9 in the middle of a row: the stage stops by itself, and no published event is lost."""
+    """kill -9 in the middle of a row: the stage stops without a command, and no published event is lost."""
     homed_host.must_accept(homed_host.make_begin("killed"))
     homed_host.must_accept(m.RunRow(scan_id="killed", row_index=0, take=1))
     homed_host.wait_for_event(m.RowStarted)
@@ -208,8 +208,8 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed_
     last_seen_mm = pi.uno.x_mm
     pi.box.wait(lambda: not pi.uno.moving, "the stage rests")
     beyond_mm = pi.uno.x_mm - last_seen_mm
-    # The stage stops when no heartbeat came for its timeout, and slows down. 0.1 s (chosen) is for the steps between
-    # the kill and the reading of its position.
+    # The stage stops when no heartbeat came for its timeout, and slows down. 0.1 s is for the steps between the kill
+    # and the reading of its position.
     stopping_s = pi.rig.stage.heartbeat_ms / 1e3 + 0.1
     ramp_mm = in_row_mm_s**2 / 2 / pi.rig.stage.accel_mm_s2
     assert beyond_mm <= stopping_s * in_row_mm_s + ramp_mm
@@ -281,7 +281,7 @@ def test_an_update_and_a_roll_back_change_the_release_alone(pi: InstalledPi):
 
 
 def test_a_power_cut_in_a_row_loses_no_event_that_was_sent(pi: InstalledPi, homed_host: HostSide):
-    """After a power cut the Pi starts by itself, with its keys, ready to be homed."""
+    """After a power cut the Pi starts without help, with its keys, ready to be homed."""
     homed_host.must_accept(homed_host.make_begin("cut"))
     homed_host.must_accept(m.RunRow(scan_id="cut", row_index=0, take=1))
     homed_host.wait_for_event(m.RowStarted)

@@ -11,7 +11,7 @@ from tests.support.paths import REPO
 
 from polysight_shared.wires import WireMotion, parse
 
-# Time without a change of the motion after which the stage counts as resting; chosen.
+# Time without a change of the motion after which the stage counts as resting
 REST_S = 1.0
 
 

@@ -155,7 +155,7 @@ def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans, damage
 
 
 def test_one_of_two_simultaneous_starts_is_refused(view, scans, monkeypatch):
-    """The check that the rig is free and the start are one step, so the second request sees the first one's program."""
+    """Checking that the rig is free and starting are one step: the second request sees the first one's program."""
     # Would let both requests pass the check before either starts. With one step for both, only one comes here, and
     # the barrier breaks after 3 s.
     both_have_checked = threading.Barrier(2, timeout=3.0)
@@ -279,7 +279,7 @@ def test_a_request_can_be_repeated_and_is_checked_again(view, scans):
 
 
 def test_a_page_gets_products_of_one_generation(view, scans):
-    """The answer is for the products that the page shows, or says that they were replaced."""
+    """The answer belongs to the products that the page shows, or reports that they were replaced."""
     generation = get(view, "/api/result?scan=one")["generation"]
     assert get(view, "/api/scan?scan=one")["generation"] == generation
     assert ask(view, f"/api/map/h_amplitude?scan=one&generation={generation}")[0] == 200
@@ -307,7 +307,7 @@ def test_a_result_that_is_polled_while_products_are_replaced_is_never_a_mixture(
     worker.start()
     levels: list[str] = []
     try:
-        # Until both verdicts were seen, and 20 answers in all (chosen).
+        # Until both verdicts were seen, and at least 20 answers
         while len(set(levels)) < 2 or len(levels) < 20:
             status, body, _ = ask(view, "/api/result?scan=one")
             # 409: the products were replaced while they were being read.

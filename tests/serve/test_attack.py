@@ -37,8 +37,8 @@ class Attack(NamedTuple):
     aborts: int
 
 
-# The brief one shows in a few seconds that the test works. The long one was chosen so that the server has more work
-# than a laboratory's pages make, and so many aborts that a rare failure is seen.
+# The brief one shows in a few seconds that the test works. In the long one the server has more work than a laboratory's
+# pages make, and there are so many aborts that a rare failure is seen.
 BRIEF = Attack(streams=4, readers=10, wrong_tokens=4, connections=50, aborts=3)
 LONG = Attack(streams=48, readers=250, wrong_tokens=90, connections=1000, aborts=100)
 # Each of these scans has a live view.

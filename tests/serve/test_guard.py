@@ -53,7 +53,7 @@ def test_requests_with_the_host_name_of_another_server_are_refused(scans):
 
 
 def test_pages_of_other_sites_cannot_read_or_command(scans):
-    """Also pages that another port of this machine serves, and this address with https."""
+    """Other sites include pages of another port of this machine, and of this address with https."""
     own_origin = "http://127.0.0.1"
     with serve_folder(scans, TOKEN) as view:
         digest_before = compute_digest(scans)
@@ -205,10 +205,10 @@ def test_when_every_connection_has_a_request_the_next_one_is_answered_as_busy(sc
 
 
 def test_too_many_connections_close_silent_ones_and_none_with_unread_bytes():
-    """A request that was sent is read, whatever follows it."""
+    """A request that was sent is read, even if the connection is closed afterwards."""
 
     class Connection:
-        """What the limit uses of a connection of the server, and of its transport."""
+        """Replaces a connection of the server and its transport, as far as the limit uses them."""
 
         def __init__(self, unread: bool) -> None:
             self.unread = unread

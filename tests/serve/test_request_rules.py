@@ -101,7 +101,7 @@ def test_the_name_of_a_host_is_read_without_its_port(host, name):
         ("PUT", "/", LOCAL, {"x_polysight_token": TOKEN}, 405),
         ("POST", "/", LOCAL, {"x_polysight_token": TOKEN}, 405),
         # A command needs the token in the header, which no form or link of another site can send; the browser adds
-        # the cookie by itself, so that this is not enough.
+        # the cookie to any request, so that this is not enough.
         ("POST", "/api/stop", LOCAL, {}, 403),
         ("POST", "/api/stop", LOCAL, {"x_polysight_token": TOKEN}, 200),
         ("POST", "/api/stop", LOCAL, {"cookie": f"polysight-8080={LOCAL.session}"}, 403),
@@ -210,7 +210,7 @@ def test_a_token_is_made_once_and_only_its_user_reads_it(token_file):
 @pytest.mark.parametrize(
     ("length", "mode", "is_taken"),
     [
-        # A token that this program makes has 24 characters; one of the user's own needs at least 18 (chosen).
+        # A token that this program makes has 24 characters; one of the user's own needs at least 18.
         (18, 0o600, True),
         (17, 0o600, False),
         # Readable for the group, for all users, and only for the owner.

@@ -162,7 +162,7 @@ def read_queue_length(listener: socket.socket) -> int:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="struct tcp_info is Linux's")
 def test_connections_wait_in_the_longest_queue_that_the_system_allows():
-    """Not in the shorter one that uvicorn is configured with, 100 here."""
+    """uvicorn is configured with a shorter queue, of 100 connections here."""
 
     async def ignore(_scope, _receive, _send):
         """No requests come."""
@@ -209,7 +209,7 @@ def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
 
 @pytest.mark.parametrize("black_text", [True, False])
 def test_a_qr_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_text):
-    """A phone's camera does not read one that is light on dark."""
+    """A phone's camera does not read a code that is light on dark."""
     address = f"http://192.168.33.7:8080/#token={TOKEN}"
     expected = [[bool(module) for module in row] for row in segno.make(address, error="l").matrix_iter()]
     modules = show_on_terminal(draw_code(address), black_text)

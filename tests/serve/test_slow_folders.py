@@ -17,7 +17,7 @@ from polysight.catalogue import Scans, scans
 from polysight.serve import reading, site
 from polysight_shared.errors import ErrorCode
 
-# Time limit of a read in these tests, instead of 30 s: short, since each test waits for it (chosen).
+# Time limit of a read in these tests, instead of 30 s: short, since each test waits for it
 LIMIT_S = 0.4
 
 
@@ -154,7 +154,7 @@ def test_the_size_of_a_growing_folder_is_counted_again_sooner(root, monkeypatch)
 
 
 def test_the_times_of_folders_are_read_only_by_threads_that_may_hang(root, monkeypatch):
-    """On a disconnected drive already this read hangs."""
+    """Even this read hangs on a disconnected drive."""
     read_modified_s = scans._read_modified_s
     asking: set[threading.Thread] = set()
 

@@ -61,7 +61,7 @@ class StillWatch:
         self.state = self.state.publish(replace(snapshot, status=status, verdict=verdict))
 
     def close(self) -> None:
-        """No program runs."""
+        """Nothing is to be closed: no program runs."""
 
 
 @pytest.fixture

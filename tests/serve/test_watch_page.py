@@ -16,7 +16,7 @@ PICTURES = "[...document.querySelectorAll('.view img')]"
 
 
 def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
-    """Open the page and wait for its first state. Without a token the browser is one that was never here."""
+    """Open the page and wait for its first state. Without a token the browser has never visited the page."""
     if not token:
         browser.forget(view.address)
     browser.visit(view.address + (f"/#token={token}" if token else "/"), size)

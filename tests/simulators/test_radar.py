@@ -241,6 +241,7 @@ def test_gains_are_within_their_spread_fixed_for_a_power_cycle_and_new_in_the_ne
     board = on.rig.by_name("RV")
     set_gains = power_on(on.rig, on.scene, board, seed=3).gains
     gains_of_next_cycle = power_on(on.rig, on.scene, board, seed=4).gains
+    # Equal within rounding of single precision
     assert np.allclose(gain_of_rx, set_gains, atol=1e-5)
     assert not np.allclose(set_gains, gains_of_next_cycle)
 
@@ -325,6 +326,7 @@ def test_clipping_is_bounded_and_counted() -> None:
     counts = np.rint(np.abs(signal) * np.float32(32767 / 0.5))
     assert frames.max() == 32767
     assert frames.min() == -32768
+    # 32767 is the largest count.
     assert loud.clipped["RH"] == (counts > 32767).sum()
     assert loud.clipped["RH"] > 0
     quiet.chirps("RH", ZERO, ZERO)

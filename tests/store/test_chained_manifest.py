@@ -33,7 +33,7 @@ def lines(tmp_path_factory) -> list[bytes]:
 
 
 def test_a_line_has_the_first_16_digits_of_the_sha_256_of_the_line_before(lines):
-    """As docs/spec/scan-folder.md says, for programs that check the chain themselves."""
+    """docs/spec/scan-folder.md describes the chain of lines for programs that check it themselves."""
     for before, line in itertools.pairwise(lines):
         assert json.loads(line)["previous"] == hashlib.sha256(before.rstrip(b"\n")).hexdigest()[:16]
 
@@ -48,7 +48,7 @@ def test_missing_lines_are_reported_and_the_others_are_valid(lines, first, count
 
 
 def test_a_line_that_was_replaced_is_reported_at_the_next_line(lines):
-    """The other line is valid in itself; the next one has the digest of the line that was there."""
+    """The other line is valid in itself; the next one has the digest of the original line."""
     changed_fact = json.loads(lines[3])
     changed_fact["row"] = 77
     del changed_fact["crc"]

@@ -68,7 +68,7 @@ def is_without_effect(path: tuple[str | int, ...]) -> bool:
 
 
 def test_every_key_is_taken_up_or_refused_by_name(begun):
-    """Each number, text and switch of the rig file, changed alone."""
+    """Each number, text and switch of the rig file is changed alone."""
     accepted = 0
     refused = 0
     for path, value in list_leaves(to_builtins(begun)):
@@ -111,7 +111,7 @@ def move_rig(rig: Instrument) -> Instrument:
 
 
 def test_new_connection_settings_are_used_from_then_on(undisturbed_scan, tmp_path):
-    """By readers, and by later resumes without options. The first settings are still in the manifest."""
+    """Readers use them, and later resumes without options. The first settings are still in the manifest."""
     small = undisturbed_scan.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)
     begun = scan.instrument

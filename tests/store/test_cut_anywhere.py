@@ -127,7 +127,7 @@ def test_an_event_log_that_was_cut_is_completed_from_the_journal(undisturbed_sca
 
 
 def test_a_flipped_bit_of_the_event_log_is_reported(undisturbed_scan, tmp_path, sample):
-    """By the digest if the log can still be read; else the events come from the journal again."""
+    """The digest shows it if the log can still be read; otherwise the events come from the journal again."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     committed = load_facts(undisturbed_scan.path, "row_committed")[-1]["events"]["bytes"]
     for bit in sample(range(8 * committed), 16):

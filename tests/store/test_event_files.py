@@ -1,4 +1,4 @@
-"""What an event file holds: the events up to its first damage, and which event that is."""
+"""Event files are read up to their first damage, and the damaged event is named."""
 
 import pytest
 

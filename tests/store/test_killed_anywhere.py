@@ -1,6 +1,6 @@
 """The host and the Pi are killed, or lose power, at every disk operation; the scan resumes.
 
-In one process, with the code that writes files in the instrument; tests/e2e kills real processes.
+All runs in one process, with the code that writes files in the instrument; tests/e2e kills real processes.
 """
 
 import shutil
@@ -15,7 +15,7 @@ from tests.support.store.small_scan import Samples, SmallScan
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 
-# After a power cut a random part of the unsynced data is on the disk: so many draws for each operation (chosen).
+# Draws for each operation: after a power cut a random part of the unsynced data is on the disk.
 POWER_CUTS = 12
 pytestmark = [
     # A killed program closes no file.
@@ -67,6 +67,7 @@ def list_disk_operations(samples: Samples, folder: Path) -> list[str]:
 @pytest.mark.parametrize("fault", ["killed", "killed within", "power cut"])
 def test_a_scan_that_was_killed_at_any_operation_resumes(samples, undisturbed_scan, tmp_path, fault, sample):
     operations = list_disk_operations(samples, tmp_path / "count")
+    # The operations were recorded.
     assert len(operations) > 100
     draws = POWER_CUTS if fault == "power cut" else 1
     for step, seed in sample([(step, seed) for step in range(1, len(operations) + 1) for seed in range(draws)], 12):
@@ -88,6 +89,7 @@ def test_a_scan_that_lost_all_unsynced_data_resumes(samples, undisturbed_scan, t
         for position, description in enumerate(operations, 1)
         if description in folders or description.endswith(" manifest.jsonl")
     ]
+    # The operations were found.
     assert len(steps) > 16
     for position in sorted({*steps, *(position + 1 for position in steps if position < len(operations))}):
         folder = tmp_path / str(position)

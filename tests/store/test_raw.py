@@ -111,7 +111,7 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
 
 
 def test_products_that_are_replaced_after_a_drop_keep_its_mark(scan):
-    """Also if they were being processed while the raw data was dropped."""
+    """The mark is kept although the products were being made while the raw data was dropped."""
     pipeline = process_rows(ScanFolder.load(scan), scan)
     assert drop_raw(scan, None, yes=True) == 0
     make_products(pipeline, scan / "products", ())
@@ -244,7 +244,10 @@ class PowerCut(BaseException):
 
 @pytest.mark.parametrize("cut_after", range(ROWS * (BOARDS + 1)))
 def test_a_drop_that_was_interrupted_leaves_a_valid_folder_and_the_next_one_ends_it(scan, monkeypatch, cut_after):
-    """The steps: a line in the manifest and a removal for each board, row after row. The program ends before each."""
+    """The steps are a line in the manifest and a removal for each board, row after row.
+
+    The program ends before each step.
+    """
     digests = find_processed_digests(scan / "products")
     steps = iter(range(ROWS * (BOARDS + 1)))
     unlink = Path.unlink

@@ -1,4 +1,4 @@
-"""Manifest, scan folder, events and their validation, damaged in every way."""
+"""Manifest, scan folder and events are read as written; each kind of damage is found by `validate`."""
 
 import zlib
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_a_manifest_has_the_facts_that_were_written(facts):
 
 @given(st.lists(facts, min_size=1, max_size=3), st.data())
 def test_a_line_with_a_flipped_bit_is_never_read_as_another_fact(facts, data):
-    """It is refused, unless the bit does not change its meaning (such as E for e in 1e5)."""
+    """The line is refused, unless the bit does not change its meaning (such as E for e in 1e5)."""
     lines = [encode_line(f) for f in facts]
     line_number = data.draw(st.integers(0, len(lines) - 1))
     bad = bytearray(lines[line_number])

@@ -153,7 +153,7 @@ def test_loops_agree_for_any_linear_part(loops, rig, linear, filtered):
 
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
 def test_loops_agree_for_any_number_of_samples(loops, rig, samples, linear):
-    """Also if samples do not fill whole vectors or blocks."""
+    """The samples here do not fill whole vectors or blocks."""
     words = draw_bursts(samples=samples)
     assert_aligned_equally(loops, words, ALL_VALID, linear, make_equaliser(rig))
 

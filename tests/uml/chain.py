@@ -25,7 +25,7 @@ from polysight_shared.wires import WireEdge, parse
 
 # GPIO lines of a Raspberry Pi's header.
 LINES = 28
-# Longest time of a row or of a program's end, and attempts to home on a busy machine; both chosen.
+# Longest time of a row or of a program's end, and attempts to home on a busy machine
 LIMIT_S = 600.0
 HOMINGS = 5
 WIRES = Path("/run/wires")

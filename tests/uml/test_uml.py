@@ -1,6 +1,6 @@
 """The chain on a kernel's own GPIO chip: emulated UNO, serial port, trigger wire, libgpiod, the Pi's program, SYNC_IN.
 
-`make test-uml` runs these; docs/decisions/0005-firmware.md says what is real in it. Figures are printed.
+`make test-uml` runs these; docs/decisions/0005-firmware.md lists its real parts. Figures are printed.
 """
 
 import itertools
@@ -19,7 +19,7 @@ PERIOD_NS = 1_500_000
 SYNC_OUT = 22
 # Time between two positions: 2 mm at 20 mm/s.
 SPACING_NS = 100_000_000
-# Takes of a row in real time; chosen. Each is half as fast as the one before.
+# Takes of a row in real time, each half as fast as the one before
 TAKES = 6
 # By which reading the clock advances virtual time (Linux, arch/um/kernel/time.c, TIMER_MULTIPLIER).
 CLOCK_READING_NS = 256
@@ -108,9 +108,10 @@ def test_a_published_row_in_virtual_time(run_row):
     bursts = read_bursts(result)
     print_figures("virtual time", bursts)
     assert sum(len(burst) for _, burst in bursts) == 5600
+    # 2 us are 0.13 % of a period of 1.5 ms.
     assert max(map(abs, compute_period_errors_ns(bursts))) <= 2_000
     edges = [capture.edge_ns for capture, _ in bursts]
-    # 0.5 ms are 10 um of the stage's way; chosen.
+    # In 0.5 ms the stage moves by 10 um, which is 0.5 % of the step between two positions.
     assert all(abs(b - a - SPACING_NS) <= 500_000 for a, b in itertools.pairwise(edges))
 
 
@@ -152,7 +153,7 @@ def test_a_row_in_real_time(run_row):
             return
         fault = result["finished"][1]
         print_figure(f"a take at {speed_mm_s:g} mm/s ended with {result['finished']}, {result['late_ns']} ns late")
-        # The Pi accepts edges within a share `TOLERANCE` of the interval; a tenth (chosen) is for its own delay.
+        # The Pi accepts edges that are off by up to `TOLERANCE` times the interval; a tenth of that is its own delay.
         interval_ns = SPACING_NS * 20.0 / speed_mm_s
         wire_was_late = result["late_ns"] > 0.9 * TOLERANCE * interval_ns
         assert fault in FAULTS_OF_A_LATE_PROGRAM or (fault == PiFault.EDGE_TIME and wire_was_late), result["finished"]

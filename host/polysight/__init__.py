@@ -4,9 +4,9 @@ The names below are the public Python interface. They are imported when first us
 and needs no other package. Start with :func:`open_scan`.
 
 `pipeline.py` is the whole flow on one screen. Every folder is a room: its `__init__` says what it takes and gives, and
-neighbours import from there only, but from `jobs` and `api` by module (docs/decisions/0008-rooms.md). Beside
-this package: `polysight_shared` (configuration, messages, errors), `polysight_pi` (the Raspberry Pi),
-`polysight_simulators`, `polysight_papers`.
+other folders import from there only, except from `jobs` and `api`, whose modules are imported directly
+(docs/decisions/0008-rooms.md). The other packages of the project are `polysight_shared` (configuration, messages,
+errors), `polysight_pi` (the Raspberry Pi), `polysight_simulators` and `polysight_papers`.
 """
 
 from __future__ import annotations

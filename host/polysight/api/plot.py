@@ -13,12 +13,13 @@ from polysight.products import ProcessedScan
 from polysight.report import draw_overview, figure_label, font_families
 from polysight.results import CheckResult
 
-# Inches, chosen by eye: width of a picture; what its colour bar and the axis of the next one add; height of a title
-# and axis.
+# Sizes in inches, chosen by eye. Width of a picture.
 _PANEL_IN = 3.8
+# Width of its colour bar and of the axis of the next picture.
 _BETWEEN_IN = 1.2
+# Height of a picture's title and axis.
 _TITLE_IN = 0.4
-# The title of the whole figure.
+# Height of the title of the whole figure.
 _HEAD_IN = 0.5
 
 

@@ -566,9 +566,11 @@ class Scan:
         """The result if it is saved or was computed already; else None."""
         if self._saved is not None:
             return self._saved
-        # Cached properties that were computed are in their instance's dict; asking for them would compute them. If
-        # `_processing` was not, `self` takes its place, which has no `referenced` in its dict.
-        processing = vars(self).get("_processing", self)
+        # The value of a cached property is in its instance's dict once it was computed. The properties themselves are
+        # not used here, because that would compute them.
+        processing = vars(self).get("_processing")
+        if processing is None:
+            return None
         return vars(processing).get("referenced")
 
     @cached_property

@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_safely(argv: Sequence[str]) -> int:
-    """Run one command; return its exit status, also of an error, which is told in words."""
+    """Run one command; return its exit status, also after an error, whose message goes to stderr."""
     from polysight_shared.program import (
         close_standard_output,
         expand_home,

@@ -276,11 +276,11 @@ def leakage_of_scans(
 def _estimate_leakage_std(
     plate: tuple[Image, Image], strips: Sequence[tuple[float, Image, Image]], mask: Mask, theta_rad: float
 ) -> float:
-    """Standard error of each part of the leakage: how far the quarters of the plane disagree, not less than 0.001.
+    """Standard error of each part of the leakage, from the differences between the quarters of the plane.
 
-    What makes it wrong (edges, wires that are not straight, uneven light) differs from place to place as speckle does,
-    and is no smaller over the whole than half of what it is in a quarter. With fewer than two usable
-    quarters it is 0.001.
+    The errors by edges, by wires that are not straight and by uneven illumination differ from place to place, as
+    speckle does: the mean of four quarters has half of the standard deviation of one. The result is at least
+    `LEAST_LEAKAGE_STD`, and equal to it with fewer than two usable quarters.
     """
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
     middle = [float(np.median(index[mask])) for index in (rows, columns)]

@@ -536,9 +536,16 @@ def _describe_contradictions(
         return []
     names_by_angle = []
     for i, angle_deg in enumerate(angles_deg):
-        # Features of the angles are side by side in columns; evidence has one entry for each angle.
-        features = [np.split(match.features, len(angles_deg), 1)[i] for match in matched]
-        evidence = [match.evidence if match.evidence is None else match.evidence[i : i + 1] for match in matched]
+        features: list[npt.NDArray[np.float64]] = []
+        evidence: list[Any] = []
+        for match in matched:
+            # Features of the angles are side by side in columns; evidence has one entry for each angle.
+            features_by_angle = np.split(match.features, len(angles_deg), axis=1)
+            features.append(features_by_angle[i])
+            if match.evidence is None:
+                evidence.append(None)
+            else:
+                evidence.append(match.evidence[i : i + 1])
         names_by_angle.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
     lines = []
     for match, together, *single_scans in zip(matched, named, *names_by_angle, strict=True):

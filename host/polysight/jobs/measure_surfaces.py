@@ -23,9 +23,9 @@ from polysight_shared.files import write_atomically
 
 # Largest number of points of the metal sphere that the calibration file keeps; chosen.
 KEPT_POINTS = 240
-# Standard errors of antenna places that were measured by hand, and of those that `calibrate direct-path` measured; both
-# assumed.
+# Standard error of antenna places that were measured by hand; assumed.
 PLACE_STD_M = 1e-3
+# Standard error of antenna places that `calibrate direct-path` measured; assumed.
 CALIBRATED_PLACE_STD_M = 3e-4
 
 

@@ -199,7 +199,8 @@ def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
 def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
     """Make a reference from images of a metal plate. Raises DataError if they show none, or a plate of no metal."""
     reference = plane_reference(images.level(images.valid), name=pipeline.source.scan_id)
-    level_db = 20 * float(np.log10(np.median(np.abs(reference.v[reference.valid] / reference.h[reference.valid]))))
+    ratio = reference.v[reference.valid] / reference.h[reference.valid]
+    level_db = 20 * float(np.log10(np.median(np.abs(ratio))))
     if pipeline.synchroniser.direct_path_known and level_db < WEAK_V_DB:
         raise DataError(
             f"the reference scan {pipeline.source.scan_id} shows no metal",

@@ -15,10 +15,11 @@ from polysight_simulators.cards import SOURCE_PORT, bind_udp
 
 # Subnets that are tried, because other programs may hold ports of some. Chosen.
 _TRIES = 50
-# Ports and last byte of the address of the simulated Pi, and port of the native connection of a simulated radar.
+# Ports of the simulated Pi, and the last byte of its address.
 _COMMAND_PORT = 5601
 _EVENT_PORT = 5602
 _PI_HOST_PART = "10"
+# Port of the native connection of a simulated radar.
 _RADAR_PORT = 5700
 
 

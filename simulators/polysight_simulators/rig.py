@@ -39,8 +39,9 @@ from polysight_simulators.wires import MAX_SOCKET_PATH
 MIN_HEARTBEAT_MS = 2000
 # Firmware image of the radars in the folder of the rig.
 IMAGE_FILE = "firmware.bin"
-# Wall times until all processes have printed `ready`, and from SIGTERM to SIGKILL. Chosen for a busy machine.
+# Longest wall time until all processes have printed `ready`; chosen for a busy machine.
 READY_TIMEOUT_S = 60.0
+# Wall time from SIGTERM to SIGKILL; chosen for a busy machine.
 STOP_TIMEOUT_S = 5.0
 # Largest speed of the emulated UNO: its heartbeat clock is scaled, that of the Pi's program is not.
 UNO_TIME_SCALE = 2.0

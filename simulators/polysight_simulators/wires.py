@@ -24,8 +24,9 @@ from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, Protoco
 from polysight_shared.wires import WireMotion, parse
 from polysight_simulators.process import announce_ready, make_parser, run_until_stopped
 
-# Limits, chosen: several times the longest line of the protocol, and about two million edges for a stopped client.
+# Longest line that is accepted; chosen, several times the longest line of the protocol.
 MAX_LINE_BYTES = 200
+# Most bytes that a client may leave unread; chosen, about two million edges for a stopped client.
 MAX_PENDING_BYTES = 64 << 20
 # `sun_path` of Linux holds 108 bytes with its terminator.
 MAX_SOCKET_PATH = 107
@@ -90,8 +91,9 @@ class WireHub:
         self._accepted = 0
         # Motion line sent last, for late subscribers.
         self._last_motion = b""
-        # GPIO lines (numbers as bytes) that a fault has cut; the line that repeats the edges of a joined one.
+        # Numbers, as bytes, of the GPIO lines that a fault has cut.
         self._cut: set[bytes] = set()
+        # Number of a joined GPIO line to that of the line that repeats its edges.
         self._joined: dict[bytes, bytes] = {}
 
     def serve(self, stop: Event, poll_s: float = 0.1) -> None:

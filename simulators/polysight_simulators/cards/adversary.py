@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight_shared.units import NS_PER_MS
 from polysight_simulators.cards.dca1000 import DATA_HEADER_BYTES, Packetiser
 
 NETWORK_TROUBLES = (
@@ -150,8 +151,7 @@ class Adversary:
         """
         rng = self._rng
         byte_generator = np.random.default_rng(rng.getrandbits(32))
-        # Without zeros: those stand for bytes that are missing.
-        frames = byte_generator.integers(1, 256, (pulses_ns.size, self._frame_bytes), np.uint8)
+        frames = _draw_bytes(byte_generator, (pulses_ns.size, self._frame_bytes))
         edges = [(int(t), frames[k]) for k, t in enumerate(pulses_ns)]
         if "missed" in troubles:
             for _ in range(rng.randint(1, min(3, len(edges) - 1))):
@@ -159,18 +159,19 @@ class Adversary:
         if "near" in troubles:
             t, _ = edges.pop(rng.randrange(len(edges)))
             edge_near_pulse = t + rng.choice([-1, 1]) * rng.randint(NEAREST_EDGE_NS, 5 * _FRAME_NS)
-            edges.append((edge_near_pulse, byte_generator.integers(1, 256, self._frame_bytes, np.uint8)))
+            edges.append((edge_near_pulse, _draw_bytes(byte_generator, self._frame_bytes)))
         if "spurious" in troubles:
             for _ in range(rng.randint(1, 2)):
                 t = rng.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
                 # An edge during a frame or just after it starts none; one near a missed pulse counts as that pulse.
-                if np.abs(np.append(pulses_ns, [e for e, _ in edges]) - t).min() > 5 * _FRAME_NS:
-                    edges.append((t, byte_generator.integers(1, 256, self._frame_bytes, np.uint8)))
+                pulses_and_edges_ns = np.append(pulses_ns, [edge_ns for edge_ns, _ in edges])
+                if np.abs(pulses_and_edges_ns - t).min() > 5 * _FRAME_NS:
+                    edges.append((t, _draw_bytes(byte_generator, self._frame_bytes)))
         edges.sort(key=lambda edge: edge[0])
         if "endless" not in troubles:
             edges = edges[: pulses_ns.size]
         times = [t for t, _ in edges]
-        self._now_ns = int(pulses_ns[0]) - 50_000_000
+        self._now_ns = int(pulses_ns[0]) - 50 * NS_PER_MS
         sent = self.record(len(edges), troubles, b"".join(f.tobytes() for _, f in edges), times)
         sent.is_complete = sent.is_complete and len(edges) == pulses_ns.size
         sent.data = frames.tobytes()
@@ -187,10 +188,10 @@ class Adversary:
         self._number += 1
         if not data:
             byte_generator = np.random.default_rng(rng.getrandbits(32))
-            data = byte_generator.integers(1, 256, frames * self._frame_bytes, np.uint8).tobytes()
-        begin_ns = self._now_ns + 1_000_000
+            data = _draw_bytes(byte_generator, frames * self._frame_bytes).tobytes()
+        begin_ns = self._now_ns + NS_PER_MS
         if edges_ns is not None:
-            begin_ns = edges_ns[0] - 1_000_000
+            begin_ns = edges_ns[0] - NS_PER_MS
         sent = SentRecord(self._number, data, begin_ns, troubles=troubles)
         packets, last_bytes = self._make_packets(sent, data)
         made_ns = [begin_ns + (k + 1) * _GAP_NS for k in range(len(packets))]
@@ -204,11 +205,11 @@ class Adversary:
         arriving = self._transmit(packets, made_ns, sent)
         if "twin" in troubles or "twin_alone" in troubles:
             sent.is_complete = False
-            twin_data = np.random.default_rng(rng.getrandbits(32)).integers(1, 256, len(data), np.uint8)
+            twin_data = _draw_bytes(np.random.default_rng(rng.getrandbits(32)), len(data))
             twin = [bytes(p) for p in [*self._twin.feed(twin_data), *self._twin.flush()]]
             arriving += [Arrival(made_ns[min(k, len(made_ns) - 1)], p, -1) for k, p in enumerate(twin)]
             arriving.sort(key=lambda a: a.t_ns)
-        # Half of them come among the first three packets.
+        # About half of the delayed packets come among the first three packets.
         for late_packet in packets_between:
             latest_place = len(arriving)
             if rng.random() < 0.5:
@@ -220,7 +221,7 @@ class Adversary:
             arriving.insert(place, Arrival(t_ns, late_packet.packet, late_packet.record))
         arrivals_before = [Arrival(self._now_ns + k * 1000, a.packet, a.record) for k, a in enumerate(packets_before)]
         sent.arrivals = arrivals_before + arriving
-        self._now_ns = max([begin_ns, *(a.t_ns for a in arriving)]) + 10_000_000
+        self._now_ns = max([begin_ns, *(a.t_ns for a in arriving)]) + 10 * NS_PER_MS
         return sent
 
     def _make_packets(self, sent: SentRecord, data: bytes) -> tuple[list[bytes], list[int]]:
@@ -355,8 +356,8 @@ class Adversary:
         if "flows" in troubles:
             coming = [(t_ns + 100_000 * (k % 3), k, p) for t_ns, k, p in coming]
         if "held" in troubles:
-            # Of three packets one comes at once, one with the fifth packet behind it, one with the tenth, and 1 or 2 ns
-            # later than that.
+            # Of three packets the first comes immediately, the second 1 ns after the fifth packet that follows it, and
+            # the third 2 ns after the tenth.
             held_until = [min(k + 5 * (k % 3), n - 1) for _, k, _ in coming]
             coming = [(made_ns[last] + k % 3, k, p) for last, (_, k, p) in zip(held_until, coming, strict=True)]
         return [Arrival(t_ns, p, sent.number) for t_ns, _, p in sorted(coming, key=lambda c: c[0])]
@@ -371,3 +372,8 @@ class Adversary:
             damaged_packet[bit // 8] ^= 1 << bit % 8
             return bytes(damaged_packet)
         return packet
+
+
+def _draw_bytes(generator: np.random.Generator, shape: int | tuple[int, ...]) -> NDArray[np.uint8]:
+    """Draw data bytes from 1 to 255; zeros stand for bytes that are missing."""
+    return generator.integers(1, 256, shape, np.uint8)

@@ -33,8 +33,9 @@ Rows = NDArray[np.uint8]
 Clock = Callable[[], float]
 # Option of linux/udp.h: the kernel cuts one buffer into equal datagrams.
 _UDP_SEGMENT = 103
-# Most bytes and packets of one call: below the largest UDP datagram.
+# Most bytes of one call: below the largest UDP datagram.
 _CALL_BYTES = 65_000
+# Most packets of one call.
 _CALL_SEGMENTS = 44
 # The next packets (about 100 kB) are sent while fewer bytes than these are unread at the receiver.
 _UNREAD_BYTES = 128 << 10

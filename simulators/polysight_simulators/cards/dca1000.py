@@ -213,11 +213,11 @@ class Card:
     def power_cycle(self) -> None:
         """Switch off and on: activate the EEPROM's addresses, reset everything else."""
         self.network = self._eeprom
-        self._power_up(1, 0)
+        self._power_up(sequence=1, byte_count=0)
 
     def reset_fpga(self) -> None:
         """Reset everything but the addresses. A record ends without its last packet and without a status."""
-        self._power_up(1, 0)
+        self._power_up(sequence=1, byte_count=0)
 
     @property
     def recording(self) -> bool:

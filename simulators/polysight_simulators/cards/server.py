@@ -66,9 +66,11 @@ class CardServer:
         self._selector.register(wires, selectors.EVENT_READ)
         for server in (*control, *chips):
             self._selector.register(server, selectors.EVENT_READ)
-        # True while the wires are watched; true while their client may have unread lines; time of the next read.
+        # True while the wires are watched.
         self._listening = True
+        # True while the client of the wires may have unread lines.
         self._unread = False
+        # Time of the next read, by `clock_s`.
         self._next_read_s = 0.0
 
     @property

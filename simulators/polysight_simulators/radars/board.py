@@ -220,7 +220,7 @@ class RadarBoard:
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
             cores.armed = False
             # Type (firmware error), code (not triggered by a pulse), line of the firmware (made up), reserved bytes.
-            self._send_event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
+            self._send_event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), delay_s=0.0)
             return False
         self._pulse_s = time_s
         cores.frame_ends = self.now() + period
@@ -232,7 +232,7 @@ class RadarBoard:
 
     def send_event(self, number: int, data: bytes = b"") -> None:
         """Send an event now."""
-        self._send_event(number, data, 0.0)
+        self._send_event(number, data, delay_s=0.0)
 
     # --- words --------------------------------------------------------------------------------------------------------
     # A message is a sync word (4 bytes), a header (12: opcode, length without the sync word, flags, remaining
@@ -335,12 +335,12 @@ class RadarBoard:
             refusal = encode_message(
                 direction=direction, kind=NACK, number=number, body=b"", count=0, sequence=sequence, wide=wide
             )
-            self._send(refusal, 0.0)
+            self._send(refusal, delay_s=0.0)
             return
         is_retry = flags & 3 == 3
         if is_retry and self._last_answer[0] == sequence and self._last_answer[1]:
             # Repeat the answer, without executing the command again
-            self._send(self._last_answer[1], 0.0)
+            self._send(self._last_answer[1], delay_s=0.0)
             return
         delay_s = ANSWER_S
         error = 0
@@ -390,7 +390,7 @@ class RadarBoard:
         """Send an answer after a delay, damaged by the fault."""
         if fault is Fault.EVENT_BETWEEN:
             # The report of a run-time calibration: harmless.
-            self._send_event(0x1012, bytes(20), 0.0)
+            self._send_event(0x1012, bytes(20), delay_s=0.0)
         elif fault is Fault.BAD_CRC:
             answer = answer[:-1] + bytes((answer[-1] ^ 1,))
         elif fault is Fault.BAD_CHECKSUM:

@@ -109,8 +109,8 @@ def encode_patch_version(image: bytes, main: bool) -> bytes:
     return bytes((major, minor, *date, build << 4 | debug))
 
 
-# Durations of boot, RF power-up, RF calibration and erasing the flash, and delay of an event. Chosen: real timing is
-# not known.
+# Durations of boot, RF power-up, RF calibration and erasing the flash, and the delay of the events `TRIGGER_READY` and
+# `FRAME_END`, in this order. All are chosen: real timing is not known.
 BOOT_S = 0.05
 RF_UP_S = 0.02
 RF_INIT_S = 0.3

@@ -112,28 +112,32 @@ class StageLogic:
         self.activity = "idle"
         self.alarm: StageError | None = None
         self.homed = False
-        # For the `done` line of the last motion command: whether a HOLD came during the row, and which command it was.
+        # True if a HOLD came during the last row; its `done` line says so.
         self.held = False
+        # True if the last motion command was ROW or HOME, whose `done` line has further fields.
         self.row_command = False
         self.homing_command = False
+        # True if a STATUS byte has not been answered yet.
         self.status_requested = False
         # A byte that counts as a heartbeat came; cleared when its time is noted.
         self.heard = False
         # Why the motion is to end once the stage rests.
         self._stopping: StageError | None = None
         self._enabled = False
-        # A STOP, and a confirmed RESUME, that `service` still has to obey.
+        # True if `service` still has to obey a STOP, or a RESUME that was confirmed.
         self._stop = False
         self._resume = False
         # RESUME counts only when it comes twice in a row; True after the first.
         self._resume_begun = False
         self._byte_seen = False
         self._quiet = True
-        # Homing: whether the stage was homed before, the switches (bits) found since the last reset, the steps of the
-        # present search, and whether a leg of the present phase was made.
+        # True if the stage was homed when the present homing began.
         self._was_homed = False
+        # Switches that were found since the last reset, as bits.
         self._found_switches = 0
+        # Steps of the present search for a switch.
         self._searched_steps = 0
+        # True if a leg of the present phase of homing was made.
         self._homing_leg_made = False
         self._buzz_x = True
         # Leg of a homing (0 to 2 of x, 3 to 5 of y: search, release, pull off; 6: end), or of a buzz (0 to 2, 3: end).
@@ -347,12 +351,12 @@ class StageLogic:
         engine = self._engine
         self._listen(now_ms)
         if engine.fault is not None:
-            return self._raise_alarm(engine.fault, True)
+            return self._raise_alarm(engine.fault, position_lost=True)
         if engine.stable & EMERGENCY and self.alarm != StageError.EMERGENCY_STOP:
-            return self._raise_alarm(StageError.EMERGENCY_STOP, True)
+            return self._raise_alarm(StageError.EMERGENCY_STOP, position_lost=True)
         if not self.busy:
             if self._stop and self.alarm is None:
-                return self._raise_alarm(StageError.STOPPED, False)
+                return self._raise_alarm(StageError.STOPPED, position_lost=False)
             self._stop = False
             self._resume = False
             engine.abandon()
@@ -409,12 +413,14 @@ class StageLogic:
         farthest = travel + travel // 10 + PULL_OFF
         if self._homing_leg_made and step == 0 and self._engine.reached:
             self._found_switches |= its_switch
-        # A first search moves leg by leg, until it has found the switch or the whole travel.
-        still_searches = step == 0 and not self._found_switches & its_switch and self._searched_steps < farthest
+        # A first search moves leg by leg, until it has found the switch or has moved over the whole travel.
+        was_found = bool(self._found_switches & its_switch)
+        still_searches = step == 0 and not was_found and self._searched_steps < farthest
         if self._homing_leg_made and not still_searches:
             # Search and release end at the switch; the leg that pulls off does not meet it.
-            if self._engine.reached != (step != 2):
-                return self._raise_alarm(StageError.HOMING_FAILED, True)
+            ends_at_switch = step != 2
+            if self._engine.reached != ends_at_switch:
+                return self._raise_alarm(StageError.HOMING_FAILED, position_lost=True)
             if self._phase == 2:
                 if self._was_homed:
                     self.lost_x = -self._engine.x

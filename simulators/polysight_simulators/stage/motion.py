@@ -49,23 +49,29 @@ class StepEngine:
     """One leg at a time with trapezoidal speed. Positions are steps, times are ticks of 500 ns."""
 
     def __init__(self) -> None:
-        # Position in steps; trigger points passed in this row, and trigger pulses given, which the caller counts.
+        # Position, steps.
         self.x = 0
         self.y = 0
+        # Trigger points that were passed in this row.
         self.points = 0
+        # Trigger pulses that were given; the caller counts them.
         self.pulses = 0
-        # A hold is requested; steps are due; constant speed; `Leg.until` has ended the leg.
+        # True if a hold is requested.
         self.hold = False
+        # True while steps are due.
         self.stepping = False
+        # True at constant speed.
         self.cruise = False
+        # True if `Leg.until` has ended the leg.
         self.reached = False
         # Why the leg ended early: emergency stop or limit switch; None if it did not.
         self.fault: StageError | None = None
-        # Steps left in the leg, steps to a stop from the present speed, and from the leg's rate.
+        # Steps left in the leg.
         self.left = 0
+        # Steps to a stop from the present speed, and from the leg's rate.
         self.ramp = 0
         self.ramp_full = 0
-        # Bresenham's line: steps of the axis with more steps, of the other one, and the error term.
+        # Bresenham's line: steps of the axis with more steps, those of the other axis, and the error term.
         self.major = 0
         self.minor = 0
         self.error = 0
@@ -75,12 +81,15 @@ class StepEngine:
         # Steps to the next trigger, triggers left.
         self.to_trigger = 0
         self.points_left = 0
-        # Speed in steps/s x 2^16, ticks of the present step, and the remainder carried to the next at constant speed.
+        # Speed, steps/s x 2^16.
         self.speed_q16 = 0
+        # Ticks of the present step.
         self.ticks = 0
+        # Remainder of the division into ticks, which the next step at constant speed takes over.
         self.carry = 0
-        # The debounced inputs, and the readings that differed from them.
+        # The debounced inputs, as bits.
         self.stable = 0
+        # Number of successive readings that differed from them.
         self._looks = 0
         self.leg = Leg(0, 0, MIN_RATE)
         # The firmware starts with this acceleration; the host sets another one.

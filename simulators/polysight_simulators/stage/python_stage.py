@@ -44,10 +44,12 @@ class PythonStage:
         self._now_ms = 0
         # Inputs pressed by an injected fault.
         self._pressed = 0
-        # Ticks of the last motion message, of the next step (if `_armed`), and of the end of the trigger pulse.
-        self._told = 0
+        # Tick of the last motion message.
+        self._reported = 0
+        # Tick of the next step, if `_armed`.
         self._next = 0
         self._armed = False
+        # Tick at which the trigger pulse ends; None without a pulse.
         self._fall: int | None = None
         # True place of the motors, steps from the switches; the engine counts from the zero of the last homing.
         self._x = rig.x
@@ -63,15 +65,17 @@ class PythonStage:
         self._armed = False
         self._was_homed = False
         self._line = bytearray()
-        # HELLO was accepted since the reset; it was the last line, so that any sequence number may follow.
+        # True if HELLO was accepted since the reset.
         self._greeted = False
+        # True if HELLO was the last line: any sequence number may follow it.
         self._fresh = False
         # The last answered line: its repetition gets the same answer.
         self._last: Command | None = None
         self._last_answer = b""
         self._last_is_motion = False
-        # Number of the last motion command, and its `done` or alarm line; empty while it runs.
+        # Sequence number of the last motion command.
         self._motion_sequence = 0
+        # Its `done` or alarm line; empty while it runs.
         self._outcome = b""
 
     @property
@@ -164,7 +168,7 @@ class PythonStage:
             self._settle()
             return
         self._next = self.tick + ticks
-        if engine.cruise != cruised or (not cruised and self.tick - self._told >= REPORT_TICKS):
+        if engine.cruise != cruised or (not cruised and self.tick - self._reported >= REPORT_TICKS):
             self._report_motion()
 
     def _settle(self) -> None:
@@ -220,7 +224,7 @@ class PythonStage:
 
     def _report_motion(self) -> None:
         """Queue a motion message: position in um from the zero, and the speed of x in um/s, rounded half up."""
-        self._told = self.tick
+        self._reported = self.tick
         um = 1000 / self._rig.steps_per_mm
         values = (self._x - self._zero_x, self._y - self._zero_y, self._engine.x_rate)
         self.wires.append(WireMotion(self.tick * NS_PER_TICK, *(math.floor(v * um + 0.5) for v in values)))

@@ -66,6 +66,7 @@ _PROBE_S = 2.0
 
 # A card sends its short last packet two seconds after the last data; half a second more, chosen.
 _LAST_PACKET_S = 2.5
+# Between two looks for that packet; chosen.
 _POLL_S = 0.05
 
 

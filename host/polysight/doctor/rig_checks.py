@@ -210,6 +210,7 @@ def check_time(context: CheckContext) -> Finding:
 SIMULATED_NOTE = "simulated wires: no hardware is driven"
 # Points of the row that checks the trigger line; chosen.
 _POINTS = 8
+# Time in which that row must end, and the wait for an event before its end is looked for again; chosen.
 _ROW_TIMEOUT_S = 120.0
 _POLL_MS = 100
 

@@ -32,6 +32,7 @@ _CALIBRATION_TIMEOUT_S = 5.0
 _BOOT_TIMEOUT_S = 5.0
 # For how long the reset line is held (chosen).
 _RESET_S = 0.1
+# Time in which the device reports that it is ready for triggers, or that its frame has ended (chosen).
 _READY_TIMEOUT_S = 1.0
 # Events that are kept of a board; a faulty one could report without end; chosen.
 _MAX_EVENTS = 1000

@@ -38,6 +38,7 @@ _RESTART_EVENT_S = 0.1
 # Messages that one poll reads, and its duration, at most (chosen): a device may send without end.
 MAX_MESSAGES = 64
 MAX_POLL_S = 0.25
+# Warnings that are kept of a device (chosen); further ones are dropped.
 _MAX_WARNINGS = 100
 # Bytes in which the sync word is searched after the first four: the rest of a longest message, which has 256 bytes and
 # may lie before it if its reading was interrupted.

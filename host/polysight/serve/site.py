@@ -53,6 +53,7 @@ READERS_OF_ONE_FOLDER = 2
 SIZE_AGE_S = 20.0
 # The same for a scan that is running, whose folder grows; chosen, as often as the list is looked at.
 GROWING_SIZE_AGE_S = 4.0
+# Between two looks for a newer state or motion; chosen.
 STREAM_INTERVAL_S = 0.1
 # A page that receives nothing for some of these (chosen) reconnects.
 ALIVE_INTERVAL_S = 2.0

@@ -28,6 +28,7 @@ PACKET_OVERHEAD_BYTES = 14
 TAIL_S = 2.0
 # Version 2.8: bytes 02 04 (seen).
 FPGA_VERSION = 2 | 8 << 7
+# Unit in which the card counts the delay between packets (command 0x0B).
 DELAY_TICK_S = 8e-9
 # Timeout after record start without data, until command 0x03 sets another.
 TIMER_S = 30

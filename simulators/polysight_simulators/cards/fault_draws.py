@@ -49,7 +49,7 @@ class NetworkFaults:
         rows = self._corrupt(rows)
         draws = self._rng.random((len(rows), 4))
         is_faulty = np.any(draws < (faults.loss, faults.reorder, faults.truncate, faults.duplicate), axis=1)
-        # A packet with a fault is a part by itself, and so is the next one, which may overtake it.
+        # A packet with a fault is a part of its own, and so is the next one, which may overtake it.
         cuts = {0, len(rows)}
         if self._held:
             cuts.add(1)

@@ -1,4 +1,4 @@
-"""The whole simulated rig as real processes, and the commands of both halves run as a user runs them."""
+"""A simulated rig of real processes, with the commands of the host and of the Pi run as a user runs them."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -15,12 +15,13 @@ from polysight_simulators.loopback import move_to_free_subnet
 
 @pytest.fixture(scope="session")
 def running_rig() -> Callable[..., AbstractContextManager[Rig]]:
-    """`running_rig(folder, ...)`: a simulated rig for a block."""
+    """`with running_rig(folder, ...) as rig:` runs a simulated rig during the block."""
     return run_simulated_rig
 
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
+    """Starts programs in a folder of the test, and ends them after it."""
     new_bench = Bench(tmp_path)
     yield new_bench
     new_bench.close()

@@ -1,4 +1,4 @@
-"""`polysight demo` ends cleanly when it is interrupted, and the rig runs where there is no C++ compiler."""
+"""`polysight demo` starts a simulated rig, scans and reports; when it is stopped, all of its processes end."""
 
 import signal
 
@@ -11,9 +11,9 @@ from polysight.store.manifest import decode_line
 
 @pytest.mark.parametrize("stop_signal", [signal.SIGINT, signal.SIGTERM])
 def test_a_demo_that_is_stopped_while_scanning_ends_everything(bench, scene_file, stop_signal):
-    """Ctrl-C reaches the process group, SIGTERM the demo alone."""
+    """Ctrl-C reaches all processes of the demo, SIGTERM only the demo itself."""
     out = bench.folder / "demo"
-    # A time scale of 5 (chosen) is slow enough to stop the demo within the scan.
+    # The scan runs at five times the real speed, slow enough to be stopped before its end.
     options = ("--config", RIG_FILE, "--scene", scene_file, "--out", out, "--time-scale", "5")
     demo = bench.start("polysight", "demo", *options)
 
@@ -27,25 +27,27 @@ def test_a_demo_that_is_stopped_while_scanning_ends_everything(bench, scene_file
     else:
         demo.process.terminate()
     ended = demo.wait()
-    # As of a shell whose program was stopped by Ctrl-C, also after SIGTERM.
+    # The exit status that shells give to a program that Ctrl-C stopped; here after SIGTERM, too.
     assert ended.status == 128 + signal.SIGINT
     assert ended.err.splitlines()[-1] == "polysight demo: stopped"
     assert "Traceback" not in ended.err
     assert bench.list_processes() == {}
-    assert "Traceback" not in "".join(log.read_text() for log in (out / "rig" / "logs").iterdir())
+    for log in (out / "rig" / "logs").iterdir():
+        assert "Traceback" not in log.read_text(), log
 
 
-def test_without_a_compiler_the_stage_is_the_python_stand_in(rig_without_compiler):
+def test_without_a_cpp_compiler_the_stage_is_simulated_in_python(rig_without_compiler):
     rig = rig_without_compiler
     assert "Python stand-in" in (rig.folder / "rig" / "logs" / "stage.log").read_text()
     ended = rig.scan("--no-process").wait()
     assert ended.status == 0, ended.err
     validated = rig.run_here("validate", rig.folder / "scan")
-    assert (validated.status, validated.err) == (0, "")
+    assert validated.status == 0
+    assert validated.err == ""
 
 
-def test_from_boards_with_an_empty_flash_to_the_report(bench, scene_file):
-    """The first use of a rig: the host loads the boards' firmware, configures and arms them, scans, and reports."""
+def test_a_demo_begins_with_radars_without_firmware_and_ends_with_the_report(bench, scene_file):
+    """As with a new rig: the host loads the radars' firmware, configures and arms them, scans, and reports."""
     options = ("--config", RIG_FILE, "--scene", scene_file, "--out", bench.folder / "demo")
     demo = bench.start("polysight", "demo", *options)
     ended = demo.wait()

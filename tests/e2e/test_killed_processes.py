@@ -1,8 +1,9 @@
 """SIGKILL of the host, the Pi, or both, at any point: the scan resumes, and its image is that of an undisturbed scan.
 
-Real processes on a simulated rig. The number of a kill determines its point: some come after a drawn time, others at
-an exact operation on a file (killed_at.py), in the scan or in the resume after it. `--long` takes 50 of them. Scans
-without kills count these operations: a kind of operation that no program executes would test nothing.
+The programs are real processes on a simulated rig. Each kill has a number, which determines when it comes: after a
+random time, or at an exact operation on a file (killed_at.py), in the scan or in the resume after it. With `--long`
+there are 50 kills. Scans without kills count these operations: a kind of operation that no program executes would test
+nothing.
 """
 
 from __future__ import annotations
@@ -38,23 +39,23 @@ pytestmark = pytest.mark.slow
 KILLED_AT = REPO / "tests/support/killed_at.py"
 ROWS = 4
 SCENE = write_small_scene(columns=6, rows=ROWS, step_mm=(20.0, 20.0), pulses=4, seed=4)
-# Simulated seconds per second; chosen.
+# Simulated seconds per second.
 TIME_SCALE = 50.0
-# Options of a scan: without processing, or with the metal plate's box, which so small an aperture does not find itself.
+# Options of a scan: without processing, or with the box of the metal plate, which is not found with so few positions.
 NO_PROCESSING = ("--no-process",)
 METAL = ("--metal", "0,0,50,50")
 # A row has one data file (.bin) of each of the two receivers RH and RV.
 DATA_FILES = 2 * ROWS
-# Longest wait before a kill, s; chosen. Before the first row it includes the program's start, about a second.
+# Longest wait before a kill. Before the first row it includes the program's start, about a second.
 LONGEST_WAIT_S = 0.4
 LONGEST_WAIT_AT_START_S = 2.0
-# Kills that are drawn; chosen. Six are one of each kind, see `Kill.draw`.
+# Number of kills. Six are one of each kind, see `Kill.draw`.
 KILLS = 6
 KILLS_LONG = 50
 
 
 class Place(NamedTuple):
-    """The `nth` `operation` (of `os`) on a file or folder whose path ends in `suffix`, counted from 1.
+    """A place in a program: its `nth` call of `os.<operation>` for a path that ends in `suffix`, counted from 1.
 
     A write (pwrite) is killed when half of it is written, any other operation before it is executed; see killed_at.py.
     """
@@ -69,10 +70,10 @@ def list_places(operation: str, suffix: str, last: int, first: int = 1) -> list[
     return [Place(operation, suffix, nth) for nth in range(first, last + 1)]
 
 
-# How often a scan does an operation need not be known: a place that it does not reach kills nothing. A manifest has a
-# first line, one for each row, and a few others; the last numbers beyond ROWS are chosen.
+# How often a scan executes an operation need not be known: a place that it does not reach kills nothing. A manifest has
+# a first line, one for each row, and a few others, hence the numbers above ROWS.
 HOST_PLACES = [
-    # The data of a row is on the disk, and none of its two files, or only the first one, has its final name.
+    # The data of a row are on the disk, and none of its two files, or only the first one, has its final name.
     *list_places("rename", ".bin", last=DATA_FILES),
     # Both files have their names. RV comes last: its folder is flushed, and the row is not in the manifest yet.
     *list_places("fsync", "raw/RV", last=ROWS),
@@ -83,8 +84,8 @@ HOST_PLACES = [
     # Half a record is in the file of events.
     *list_places("pwrite", "events.msgpack", last=ROWS + 2),
 ]
-# A journal gets a record for the begin and end of the run and of each row, and for each position: 34 in this scan.
-# Several are written and flushed together; the last numbers are chosen.
+# The Pi's journal gets a record for the beginning and end of the run and of each row, and for each position: 34 in this
+# scan. Several are written and flushed together, so that there are fewer operations.
 PI_PLACES = [
     # Half of the records is in the journal.
     *list_places("pwrite", ".journal", last=29),
@@ -106,10 +107,10 @@ RESUME_PLACES = [
 
 @dataclass
 class Kill:
-    """One trial: which programs are killed, where, and how its resumes are killed.
+    """One kill: which programs are killed and when, and at which places the resumes after it are killed.
 
-    Either after `rows` committed rows (-1: none, and possibly before the scan is begun) and `wait_s` seconds, or at
-    a place.
+    Programs are killed at `place`; without one, `wait_s` seconds after `rows` rows are committed (-1: after the start,
+    when the scan has possibly not begun).
     """
 
     number: int
@@ -122,38 +123,38 @@ class Kill:
 
     @staticmethod
     def draw(number: int) -> Kill:
-        """Draw the kill with this number; six in succession are two of the host, two of the Pi, and two of both.
+        """Draw the kill with this number; of six in succession two kill the host, two the Pi, and two both.
 
-        Of two kills of one program the first is at a place. Both programs are always killed after a time, because a
+        Of the two that kill one program the first is at a place. Kills of both programs come after a time, because a
         place is in one program only.
         """
         rng = random.Random(number)
-        pair, second_of_pair = divmod(number % 6, 2)
+        pair, number_in_pair = divmod(number % 6, 2)
         host = pair in (0, 2)
         pi = pair in (1, 2)
         kill = Kill(number, host, pi)
-        if second_of_pair or (host and pi):
+        if number_in_pair == 1 or (host and pi):
             kill.rows = rng.randrange(-1, ROWS)
             longest_wait_s = LONGEST_WAIT_AT_START_S if kill.rows < 0 else LONGEST_WAIT_S
             kill.wait_s = rng.uniform(0.0, longest_wait_s)
         else:
             kill.place = rng.choice(HOST_PLACES if host else PI_PLACES)
-        # Half of the scans whose host was killed are killed again, once or twice, while they resume; chosen.
+        # Half of the scans whose host was killed are killed again, once or twice, while they resume.
         if host and rng.random() < 0.5:
             kill.resumes = rng.choices(RESUME_PLACES, k=rng.randint(1, 2))
         return kill
 
 
 class KillableRig:
-    """A simulated rig whose programs can be killed, its undisturbed scan, and the check of each kill."""
+    """A simulated rig whose programs can be killed, with the data of an undisturbed scan for comparison."""
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
-        # Kinds of places that programs reached, with the name of the program.
+        # How often programs reached each kind of place, by the name of the program and the kind.
         self.reached_kinds: Counter[str] = Counter()
-        # Number of commands started so far; it names their files of reached places.
+        # Number of commands started so far, which is in the name of their files of reached places.
         self.commands_started = 0
-        # Files of reached places of the newest host command, and of the running Pi.
+        # Files of reached places of the newest command of the host, and of the running Pi.
         self.host_hits = Path()
         self.pi_hits = Path()
         undisturbed = rig.folder / "undisturbed"
@@ -185,7 +186,7 @@ class KillableRig:
         return program
 
     def restart_pi(self, places: Sequence[Place] = ()) -> None:
-        """Restart the Pi, as systemd does. With places, its next scan kills it there."""
+        """Restart the program of the Pi, as systemd does. With places, it kills itself there in its next scan."""
         self.rig.pi.kill()
         wires = self.rig.folder / "rig" / "wires.sock"
         run = ("polysight-pi", "run", "--config", self.rig.config, "--wires", wires)
@@ -211,7 +212,7 @@ class KillableRig:
         )
 
     def begin_and_kill(self, kill: Kill, folder: Path) -> None:
-        """Begin a scan, kill its processes as given, and wait until none of them runs any more."""
+        """Begin a scan, kill its programs as given, and wait until the host has ended. The Pi is restarted."""
         places = [kill.place] if kill.place else []
         if kill.pi and places:
             self.restart_pi(places)
@@ -237,23 +238,29 @@ class KillableRig:
         if kill.place and kill.host:
             self.check_died(ended.status, kill.place, self.host_hits)
         if kill.host:
-            # Success: the scan ended before the kill.
+            # 0: the scan ended before the kill.
             assert ended.status in (-signal.SIGKILL, 0), ended.err
         else:
             # Without its Pi the host reports a lost device or an incomplete scan, unless all rows were complete.
             assert ended.status in (0, DeviceError.exit_status, ScanError.exit_status), ended.err
 
     def check(self, kill: Kill) -> list[int]:
-        """Kill, resume, compare. Returns the number of rows that each resume has retaken."""
+        """Kill a scan, resume it, and check that its data and image are those of the undisturbed scan.
+
+        Returns the number of rows that each resume has scanned again.
+        """
         folder = self.rig.folder / f"scan-{kill.number}"
         self.begin_and_kill(kill, folder)
         retaken_rows = []
         # The last resume is not killed.
         for place in [*kill.resumes, None]:
             digests_before = check_committed_rows(folder, self.true_digests)
-            resumed = self.scan(folder, [place] if place else list_kinds(RESUME_PLACES)).wait()
-            assert resumed.status == 0 or (place and resumed.status == -signal.SIGKILL), f"{kill}\n{resumed.err}"
-            if place:
+            if place is None:
+                resumed = self.scan(folder, list_kinds(RESUME_PLACES)).wait()
+                assert resumed.status == 0, f"{kill}\n{resumed.err}"
+            else:
+                resumed = self.scan(folder, [place]).wait()
+                assert resumed.status in (0, -signal.SIGKILL), f"{kill}\n{resumed.err}"
                 self.check_died(resumed.status, place, self.host_hits)
             self.add_reached_kinds("resume", self.host_hits)
             digests_after = check_committed_rows(folder, self.true_digests)
@@ -264,57 +271,66 @@ class KillableRig:
         assert form_image_bytes(folder) == self.true_image, kill
         # Only the row that ran at the kill is lost.
         assert max(retaken_rows) <= 1, kill
-        started = [e for e in read_events(folder / "events.msgpack").events if isinstance(e, RowStarted)]
-        assert len({(e.row.index, e.take) for e in started}) == len(started), "a take was used twice"
+        starts = [event for event in read_events(folder / "events.msgpack").events if isinstance(event, RowStarted)]
+        takes = {(event.row.index, event.take) for event in starts}
+        assert len(takes) == len(starts), "each attempt to scan a row has a number of its own"
         return retaken_rows
 
 
 def list_kinds(places: Sequence[Place]) -> list[Place]:
-    """Every kind of these places once, with number 0: it is counted, but never kills."""
+    """Every kind of these places once, with number 0: a program counts it, and never kills itself there."""
     kinds = dict.fromkeys((place.operation, place.suffix) for place in places)
     return [Place(operation, suffix, 0) for operation, suffix in kinds]
 
 
 def has_begun(folder: Path) -> bool:
+    """True if the manifest of the scan has a whole first line."""
     path = folder / "manifest.jsonl"
     return path.exists() and manifest.read(path).length > 0
 
 
 def list_committed(folder: Path) -> list[int]:
     """Committed rows of a scan; none if it is not begun."""
-    return list(ScanFolder.load(folder).committed_rows()) if has_begun(folder) else []
+    if not has_begun(folder):
+        return []
+    return list(ScanFolder.load(folder).committed_rows())
 
 
 def compute_row_digests(folder: Path) -> dict[str, str]:
     """SHA-256 of every committed row of every board."""
-    files = [b.file for row in ScanFolder.load(folder).committed_rows().values() for b in row.boards.values()]
-    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files}
+    digests = {}
+    for row in ScanFolder.load(folder).committed_rows().values():
+        for board in row.boards.values():
+            content = (folder / board.file).read_bytes()
+            digests[board.file] = hashlib.sha256(content).hexdigest()
+    return digests
 
 
 def check_committed_rows(folder: Path, true_digests: dict[str, str]) -> dict[str, str]:
     """SHA-256 of the committed rows of an interrupted scan; all must be good. Empty if the scan is not begun."""
     if not has_begun(folder):
         return {}
-    assert [f for f in validate(folder) if f.level == "error"] == []
+    assert [finding for finding in validate(folder) if finding.level == "error"] == []
     digests = compute_row_digests(folder)
     assert digests.items() <= true_digests.items()
     return digests
 
 
 def list_retaken_rows(folder: Path) -> set[int]:
-    """Rows that the last resume had to take again because they ran when the scan was killed.
+    """Rows that the last resume had to scan again because they were being scanned when the scan was killed.
 
-    In the manifest the first take of such a row after the resume has a number above 1. A row that this resume takes
-    twice, because it rejects its own first take, has number 1 first and does not count.
+    In the manifest the first attempt ("take") at such a row after the resume has a number above 1. A row that this
+    resume scans twice, because it rejects its own first attempt, has number 1 first and does not count.
     """
     if not has_begun(folder):
         return set()
-    facts = load_facts(folder)
-    resumes = [i for i, fact in enumerate(facts) if fact["fact"] == "scan_resumed"]
-    facts_since_resume = facts[resumes[-1] :] if resumes else []
+    has_resumed = False
     first_takes: dict[int, int] = {}
-    for fact in facts_since_resume:
-        if fact["fact"] in ("row_committed", "row_rejected"):
+    for fact in load_facts(folder):
+        if fact["fact"] == "scan_resumed":
+            has_resumed = True
+            first_takes.clear()
+        elif has_resumed and fact["fact"] in ("row_committed", "row_rejected"):
             first_takes.setdefault(fact["row"], fact["take"])
     return {row for row, take in first_takes.items() if take > 1}
 
@@ -348,10 +364,10 @@ def test_a_killed_scan_resumes_to_the_undisturbed_image(killable_rig: KillableRi
     print(f"{kill}: rows retaken by each resume {retaken_rows}")  # noqa: T201 - shown with -s
 
 
-def test_every_kind_of_place_is_reached(killable_rig: KillableRig):
+def test_programs_reach_every_kind_of_place(killable_rig: KillableRig):
     """A kind that no program reaches kills nothing: its file was renamed, or is written by another operation."""
-    # Two more kills, which leave a torn manifest and torn events for the resume to cut off. They are needed if this
-    # test runs alone, or if the drawn kills left neither.
+    # Two more kills leave an incomplete last line in the manifest and an incomplete last event, which the resume cuts
+    # off. They are needed if this test runs alone, or if the random kills left neither.
     torn_manifest = Kill(number=100, host=True, pi=False, place=Place("pwrite", "manifest.jsonl", 4))
     torn_events = Kill(number=101, host=True, pi=False, place=Place("pwrite", "events.msgpack", 3))
     for kill in (torn_manifest, torn_events):
@@ -389,10 +405,10 @@ def test_products_of_a_killed_scan_are_those_of_the_undisturbed_scan(killable_ri
 
 
 def test_a_scan_without_its_pi_fails_and_resumes_with_a_pi_whose_journal_is_lost(killable_rig: KillableRig):
-    """Without a Pi the error says so; a Pi with an empty card continues after the host's last event, with a notice."""
+    """A Pi that has lost its journal (by an exchanged SD card) continues after the last event that the host has."""
     folder = killable_rig.rig.folder / "lost"
-    # The Pi kills itself: on a busy machine the scan might end before the test sees its rows and kills it. The sixth
-    # flush is chosen: some of the rows are committed then, and not all.
+    # The Pi kills itself: on a busy machine the scan might end before the test sees its rows and kills it. At the sixth
+    # flush of the journal some of the rows are committed, and not all.
     killable_rig.restart_pi([Place("fsync", ".journal", 6)])
     ended = killable_rig.scan(folder).wait()
     assert ended.status == DeviceError.exit_status

@@ -1,4 +1,7 @@
-"""The operator's page with the simulated rig, in a real browser: plan, start, pause, stop, resume, a dying server."""
+"""The operator's page in a real browser: a scan of the simulated rig is planned, started, paused, stopped and resumed.
+
+Scans continue when the server of the page is killed.
+"""
 
 import json
 import os
@@ -20,7 +23,7 @@ from polysight.store import ScanFolder, validate
 from polysight_shared.messages import BeginRun
 from polysight_shared.raster import plan_raster
 
-# Rows of a scan; chosen, so many that a scan is stopped before its end on a slow machine, too.
+# So many rows that a scan can be stopped before its end on a slow machine, too.
 ROWS = 40
 SCENE = write_small_scene(10, ROWS, step_mm=(10.0, 5.0))
 pytestmark = pytest.mark.slow
@@ -79,13 +82,14 @@ class Lab:
         assert len(ScanFolder.load(folder).committed_rows()) >= rows
 
     def wait_end(self, folder: Path) -> None:
-        """Wait until the program that the page started has ended; check the folder."""
+        """Wait until the program that the page started has ended; check the scan, and that the page had no errors."""
         self.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
-        assert [f for f in validate(folder) if f.level == "error"] == []
+        assert [finding for finding in validate(folder) if finding.level == "error"] == []
         assert self.browser.errors == []
 
 
 def _program(folder: Path) -> Any:
+    """The program that scans into a folder, or did."""
     program = find_program(folder, "scan")
     assert program is not None
     return program
@@ -113,8 +117,8 @@ def test_a_scan_is_planned_started_and_shown(lab):
     lab.wait_end(folder)
     assert ScanFolder.load(folder).plan.rows == 5
     lab.open("/")
-    # A card has no text before it is painted.
-    lab.browser.wait("document.querySelector('#list li')?.innerText", "the card of the scan")
+    # The entry of a scan has no text before it is drawn.
+    lab.browser.wait("document.querySelector('#list li')?.innerText", "the entry of the scan")
     list_text = lab.browser.read_text("list")
     assert "first" in list_text
     assert "the first one" in list_text
@@ -131,7 +135,7 @@ def test_a_scan_pauses_continues_stops_and_is_resumed(lab):
     lab.wait_rows(folder, rows_at_pause + 1)
     lab.click("pause")
     lab.wait_headline("Paused")
-    # Stopped while the stage rests: rows remain, even on a slow machine.
+    # It is stopped during the pause, so that rows are left to scan on a slow machine, too.
     lab.click("stop")
     lab.wait_headline("Stopped on request")
     lab.wait_end(folder)
@@ -146,13 +150,13 @@ def test_a_scan_pauses_continues_stops_and_is_resumed(lab):
     lab.wait_end(folder)
 
 
-def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
+def test_a_second_scan_is_refused_and_the_first_one_continues_without_its_server(lab):
     folder = lab.start("third", rows=ROWS)
     lab.wait_rows(folder, 1)
     program_before = json.loads((folder / PROGRAM_FOLDER / "scan.json").read_text())
     pid = program_before["pid"]
-    # The scan has the priority of the server, which is that of a program in a terminal. The server's own process for
-    # reading scans has a lower one, and is the first to be killed for want of memory.
+    # The scan has the priority of the server, which is that of a program in a terminal. The server has another process,
+    # which reads scans; that one has a lower priority, and is the first to be killed if memory is short.
     assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) == os.getpriority(os.PRIO_PROCESS, pid)
     assert Path(f"/proc/{pid}/oom_score_adj").read_text() == Path("/proc/self/oom_score_adj").read_text()
     lab.open("/new")
@@ -184,7 +188,7 @@ def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
 
 
 def test_findings_of_the_doctor_are_shown_while_it_runs(lab):
-    """Another host's scan runs: without it the doctor would load all cores to measure the receivers.
+    """Another host scans meanwhile: otherwise the doctor would load all cores to measure the receiving processes.
 
     That measurement is tested in tests/doctor.
     """

@@ -1,10 +1,10 @@
-"""The Pi half runs with nothing but its own dependencies: no numpy, no scipy; no gpiod where lines are simulated."""
+"""The programs of the Pi run without the packages of the host, and without gpiod where its lines are simulated."""
 
 import subprocess
 import sys
 
-# Code before that of a test: packages in `absent` cannot be imported, nor can their modules.
-BLOCK = """
+# Code that runs before that of a test and makes the packages in `absent` and their modules impossible to import.
+BLOCK_IMPORTS = """
 import sys
 class Absent:
     def find_spec(self, name, path=None, target=None):
@@ -24,8 +24,8 @@ HOST_ONLY = (
     "polysight",
     "polysight_simulators",
 )
-# Imports every module of the Pi's packages but those that run a program when they are imported.
-EVERYTHING = """
+# Imports every module of the Pi's packages, except for those that run a program when they are imported.
+IMPORT_ALL_MODULES = """
 import importlib, pkgutil
 import polysight_pi, polysight_shared
 for package in (polysight_pi, polysight_shared):
@@ -37,26 +37,34 @@ for package in (polysight_pi, polysight_shared):
 
 def run_alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
     """Run code in a new interpreter in which these packages are absent."""
-    code = BLOCK.format(absent=set(absent)) + code
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    whole_code = BLOCK_IMPORTS.format(absent=set(absent)) + code
+    return subprocess.run([sys.executable, "-c", whole_code], capture_output=True, text=True, check=False)
 
 
 def test_every_module_of_the_pi_imports_without_the_host_s_dependencies():
-    ended = run_alone(EVERYTHING, *HOST_ONLY)
-    assert (ended.returncode, ended.stderr) == (0, "")
+    ended = run_alone(IMPORT_ALL_MODULES, *HOST_ONLY)
+    assert ended.returncode == 0
+    assert ended.stderr == ""
 
 
 def test_an_absent_package_cannot_be_imported():
+    """Without this the other tests would show nothing."""
     assert "No module named 'numpy'" in run_alone("import numpy", *HOST_ONLY).stderr
 
 
-def test_gpio_without_gpiod_is_an_error_that_names_it():
-    code = (
-        "from polysight_pi.lines import load_gpiod\n"
-        "from polysight_shared.errors import PolysightError\n"
-        "try:\n    load_gpiod()\nexcept PolysightError as e:\n    print(e)\n"
-    )
-    ended = run_alone(code, *HOST_ONLY)
-    assert (ended.returncode, ended.stderr) == (0, "")
+LOAD_GPIOD = """
+from polysight_pi.lines import load_gpiod
+from polysight_shared.errors import PolysightError
+try:
+    load_gpiod()
+except PolysightError as error:
+    print(error)
+"""
+
+
+def test_if_gpiod_is_not_installed_the_error_names_it_and_says_what_to_do():
+    ended = run_alone(LOAD_GPIOD, *HOST_ONLY)
+    assert ended.returncode == 0
+    assert ended.stderr == ""
     assert "gpiod" in ended.stdout
     assert "do: " in ended.stdout

@@ -1,4 +1,4 @@
-"""A command with random arguments ends with a status and a message, never with a traceback."""
+"""A command with random arguments ends with an exit status and a message, never with a traceback."""
 
 import argparse
 import io
@@ -20,7 +20,7 @@ from polysight.cli.main import main
 from polysight_shared.errors import ConfigError, DataError, DeviceError, ScanError
 from polysight_simulators.__main__ import main as simulators
 
-# They serve, wait for a rig, or run for minutes; other tests give them wrong input.
+# These commands serve, wait for a rig, or run for minutes; other tests give them wrong input.
 NOT_DRAWN = ("serve", "preview", "demo", "simulate", "reproduce", "scan", "resume", "doctor", "card", "radar", "ask")
 # Values that are mostly wrong: no number, too large, too small, or of another form than the option takes.
 NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e308", "5e-324", "9" * 20, "1_000", "0x10", "half", "1,2", "1,2,3,4,5")
@@ -31,11 +31,9 @@ FILES = (
     "scan", "scan/raw", "scan/products", "scan/manifest.jsonl", "scan/products/image.npz", "text.txt", "random.bin",
     "empty", "array.npz", "damaged.toml", "instrument.toml", "/dev/null", "no folder/no file",
 )  # fmt: skip
-# Command lines that are drawn; chosen. With --long this many for each command.
+# Number of random command lines; with --long, number for each command.
 CASES = 60
 CASES_LONG = 500
-
-
 # Errors of the command line or of a file, a device, or a scan say what to do.
 STATUSES_WITH_A_REMEDY = (
     ConfigError.exit_status,
@@ -47,7 +45,7 @@ STATUSES_WITH_A_REMEDY = (
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A processed scan, and files that are not ours."""
+    """A folder with a processed scan, a rig file, a scene, and files of other kinds."""
     folder = tmp_path_factory.mktemp("random")
     shutil.copy(RIG_FILE, folder)
     (folder / "scene.toml").write_text(write_small_scene(12, 4, pixels=30, pixel_mm=5.0, seed=1))
@@ -66,15 +64,15 @@ def list_command_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that are drawn."""
     parser = find_parser("polysight.cli.main")
     assert parser is not None
-    subcommands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    return {name: sub for name, sub in subcommands.choices.items() if name not in NOT_DRAWN}
+    (subcommands,) = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    return {name: subparser for name, subparser in subcommands.choices.items() if name not in NOT_DRAWN}
 
 
 def draw_value(action: argparse.Action, draw: random.Random) -> str:
-    """A value of an option, which is sometimes right and mostly wrong; all shares here are chosen."""
+    """A value of an option, which is sometimes right and mostly wrong."""
     if action.choices and draw.random() < 0.6:
         return str(draw.choice(list(action.choices)))
-    # Files twice, as most arguments are files; the last values are right for many options.
+    # Files are in the list twice, as most arguments are files. The last values are right for many options.
     kind = draw.choice((FILES, FILES, NUMBERS, BOXES, LAYERS, WORDS, ("scan", "3", "out/x")))
     return draw.choice(kind)
 
@@ -99,11 +97,12 @@ def draw_words(parser: argparse.ArgumentParser, draw: random.Random) -> Iterator
 def list_number_commands(name: str, parser: argparse.ArgumentParser) -> Iterator[list[str]]:
     """Command lines of a command that give each number to each option with a value."""
     options = [action for action in parser._actions if action.option_strings and action.nargs != 0]
-    # "scan" for each argument that is no option, "out/x" for each required option.
     arguments = ["scan" for action in parser._actions if not action.option_strings]
     for option in options:
-        required = [other for other in options if other.required and other is not option]
-        required_words = [word for other in required for word in (other.option_strings[-1], "out/x")]
+        required_words = []
+        for other_option in options:
+            if other_option.required and other_option is not option:
+                required_words += [other_option.option_strings[-1], "out/x"]
         for number in NUMBERS:
             yield [name, *arguments, *required_words, f"{option.option_strings[-1]}={number}"]
 
@@ -115,14 +114,15 @@ def check_end(words: list[str]) -> None:
     try:
         with redirect_stdout(out), redirect_stderr(err):
             status = main(words)
-    except SystemExit as e:
-        # The parser of arguments raises it after an error, and after a help.
-        status = e.code
+    except SystemExit as exit_request:
+        # The parser of arguments raises it after an error, and after `--help`.
+        status = exit_request.code
     output = out.getvalue() + err.getvalue()
     assert isinstance(status, int), words
     assert output.strip() or status == 0, words
     assert "Traceback" not in output, words
-    # A note contains the text of the option; the last line of a list of scans names the folder as it was typed.
+    # A command that succeeds shows no NaN and no infinity, except for texts that were typed: those of notes, and the
+    # name of the folder in the last line of a list of scans.
     computed_text = "" if words[0] == "note" else re.sub(r"scans under .*", "", out.getvalue())
     shown_words = {word.strip("(),;:+-").lower() for word in computed_text.split()}
     if status == 0:
@@ -138,13 +138,17 @@ def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
     with chdir(folder):
         for _ in range(cases):
             name = draw.choice(list(parsers))
+            # Without --yes a command asks before it changes something, and gets no answer.
+            words = [word for word in draw_words(parsers[name], draw) if word != "--yes"]
             monkeypatch.setattr(sys, "stdin", io.StringIO(""))
-            check_end([name, *(word for word in draw_words(parsers[name], draw) if word != "--yes")])
+            check_end([name, *words])
 
 
-def test_each_option_takes_each_number_or_refuses_it(folder, monkeypatch, request):
-    lines = [words for name, parser in list_command_parsers().items() for words in list_number_commands(name, parser)]
-    # Chosen: a third as many as there are drawn lines.
+def test_each_option_accepts_or_refuses_each_number(folder, monkeypatch, request):
+    """All combinations with --long, otherwise a sample of them."""
+    lines = []
+    for name, parser in list_command_parsers().items():
+        lines += list_number_commands(name, parser)
     if not request.config.getoption("--long"):
         lines = random.Random(2).sample(lines, CASES // 3)
     with chdir(folder):

@@ -64,7 +64,6 @@ UNPACK_FUNCTIONS = {
     "event": messages.unpack_event,
     "command": messages.unpack_command,
     "reply": messages.unpack_reply,
-    "kept": messages.unpack_with_crc,
 }
 # Size, sequence number and checksum, 4 bytes each, before an event in the Pi's journal.
 JOURNAL_HEADER = struct.Struct("<III")

@@ -90,7 +90,7 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     assert MINE in (tmp_path / "csv" / "materials.csv").read_text(encoding="utf-8")
 
 
-def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
+def test_training_on_rows_and_on_saved_images_gives_the_same_entries(scans, tmp_path):
     scan = scans[2]
     out = tmp_path / "out"
     labels = tmp_path / "labels.json"
@@ -103,7 +103,7 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
     rows = make_entries(load_training_scan(scan, RIG_FILE))
     images = make_entries(load_training_scan(out, RIG_FILE))
     assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
-    # The tolerances are chosen.
+    # Differences of 0.02 degrees and 1.5e-4 are measured.
     for of_rows, of_images in zip(rows, images, strict=True):
         assert of_rows.incidence_deg == pytest.approx(of_images.incidence_deg, abs=0.05)
         assert np.median(of_rows.h) == pytest.approx(np.median(of_images.h), rel=0.02)

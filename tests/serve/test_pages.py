@@ -57,7 +57,7 @@ class Page:
         self.view = view
 
     def open(self, path: str, size: tuple[int, int, bool] = DESK, token: str = TOKEN) -> None:
-        """Open the page, and wait until it has content. With token "" the browser is one that was never here."""
+        """Open the page, and wait until it has content. With token "" the browser has never visited the page."""
         if not token:
             self.browser.forget(self.view.address)
         self.browser.visit(f"{self.view.address}{path}{f'#token={token}' if token else ''}", size)
@@ -478,7 +478,7 @@ def test_a_wrong_number_is_reported_with_the_labels_of_the_page(page):
 
 
 def test_a_scan_that_was_stopped_on_request_has_not_failed(page, scans):
-    """Its program ends with the exit status of an incomplete scan."""
+    """The program of such a scan ends with the exit status of an incomplete scan."""
     record = ProgramRecord(pid=1, ticks=0, words=["polysight", "scan"], started_utc="2026-01-01T00:00:00+00:00")
     folder = scans / "one" / PROGRAM_FOLDER
     folder.mkdir()
@@ -502,9 +502,10 @@ def test_metal_is_drawn_for_processing_again(page):
     x, y = COPPER["centre_mm"]
     page.drag(x - 12, y - 12, x + 12, y + 12)
     page.browser.wait("/mm$/.test(document.getElementById('draw-metal').innerText)", "the box")
-    sides = (
-        page.browser.read_text("draw-metal").partition(": ")[2].replace("\u2212", "-").removesuffix(" mm").split(", ")
-    )
+    # "...: x0, y0, x1, y1 mm", with typographic minus signs
+    _, _, numbers = page.browser.read_text("draw-metal").partition(": ")
+    sides = numbers.replace("\u2212", "-").removesuffix(" mm").split(", ")
+    # Within some pixels of the screen
     assert [float(side) for side in sides] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=1.5)
     page.check_whole()
 
@@ -523,15 +524,16 @@ def test_the_page_follows_products_that_another_program_has_made(page, scans):
 def test_a_long_list_is_shown_while_it_is_read(browser, tmp_path, monkeypatch):
     """Each answer of this server has one scan more; the page asks again until it has all, and shows that meanwhile."""
     monkeypatch.setattr(reading, "LIST_S", 0.0)
-    for k in range(6):
+    scans = 6
+    for k in range(scans):
         write_judged_products(tmp_path / "scans" / f"scan-{k}", "care")
     with serve_folder(tmp_path / "scans") as view:
         page = Page(browser, view)
         page.open("/?all", token="")
-        browser.wait("document.querySelectorAll('#list li').length == 6", "all of them")
+        browser.wait(f"document.querySelectorAll('#list li').length == {scans}", "all scans")
         browser.wait("!document.getElementById('count').innerText.includes('reading')", "that nothing is being read")
         requests = [url for url in browser.requests if "/api/scans" in url]
-        assert len(requests) >= 6
+        assert len(requests) >= scans
 
 
 def test_without_the_token_nothing_is_changed_and_the_page_asks_for_it(page, scans):
@@ -612,7 +614,8 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
         )
         labels = read_labels(scans / name / "labels.json")
         assert labels.metal == "copper"
-        assert labels.boxes["my plastic"] == pytest.approx([24, -6, 48, 18], abs=1.5)
+        x, y = PET["centre_mm"]
+        assert labels.boxes["my plastic"] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=1.5)
         page.check_whole()
     offered_names = "[...document.getElementById('known').options].map((option) => option.value)"
     page.browser.wait(

@@ -53,11 +53,13 @@ def test_the_rig_file_has_the_published_chirp_and_burst(rig: Instrument):
 
 
 def test_mounts_reproduce_the_published_antenna_positions(rig: Instrument):
-    """The limits are half of the last digit that is published, and a little."""
     h, v = rig.receivers
-    assert geometry.tx_position_m(rig) == pytest.approx((-0.7055, 0.0974, 0.0130), abs=6e-5)
-    assert geometry.rx_positions_m(rig, h)[0] == pytest.approx((0.6843, 0.1035, 0.0094), abs=6e-5)
-    assert geometry.rx_positions_m(rig, v)[0] == pytest.approx((0.6836, 0.1337, 0.0104), abs=6e-5)
+    # Positions are published in tenths of a millimetre: half of that, and a little for rounding
+    rounding_m = 6e-5
+    assert geometry.tx_position_m(rig) == pytest.approx((-0.7055, 0.0974, 0.0130), abs=rounding_m)
+    assert geometry.rx_positions_m(rig, h)[0] == pytest.approx((0.6843, 0.1035, 0.0094), abs=rounding_m)
+    assert geometry.rx_positions_m(rig, v)[0] == pytest.approx((0.6836, 0.1337, 0.0104), abs=rounding_m)
+    # Published in millimetres and in degrees
     assert geometry.direct_path_m(rig, h)[0] == pytest.approx(1.390, abs=5e-4)
     assert geometry.incidence_deg(rig, h) == pytest.approx(55.0, abs=0.1)
 
@@ -152,7 +154,7 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
 
 @pytest.mark.parametrize(
     ("table", "within", "beyond"),
-    # Limits of the radar, of a Pi and of its lines, and chosen ones; polysight_shared/config.py has their reasons.
+    # Limits of the radar, of a Pi and of its lines, and others; polysight_shared/config.py has their reasons.
     [
         ("chirp", {"linear_samples": [0, 12]}, {"linear_samples": [0, 11]}),
         ("chirp", {"linear_samples": [244, 256]}, {"linear_samples": [245, 257]}),

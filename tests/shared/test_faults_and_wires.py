@@ -31,7 +31,7 @@ def test_the_firmware_header_is_the_table():
     assert (REPO / "arduino_stage" / "stage_errors.h").read_text() == format_c_header()
 
 
-# Times in ns, places in um and speeds in um/s: any integers of up to 60 bits, chosen.
+# Times in ns, places in um and speeds in um/s: any integers of up to 60 bits
 integers = st.integers(-(2**60), 2**60)
 lines = st.integers(0, 60)
 levels = st.integers(0, 1)

@@ -17,7 +17,7 @@ from polysight_shared.raster import RasterPlan
 def draw_values(declared: Any) -> st.SearchStrategy:
     """A strategy of values of a declared type (msgspec.inspect) within its limits.
 
-    Sizes of texts, lists and dictionaries are chosen small, so that hypothesis tries many messages.
+    Texts, lists and dictionaries are small, so that hypothesis tries many messages.
     """
     match declared:
         case inspect.IntType():

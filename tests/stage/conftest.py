@@ -117,8 +117,8 @@ def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
         if port_of_real_stage:
             driver = PortDriver(port_of_real_stage)
         elif request.config.getoption("--long") or is_short:
-            # Three times real time, which a busy machine can simulate (chosen). The heartbeat counts wall time,
-            # however fast the motion runs.
+            # Three times real time, which a busy machine can simulate. The heartbeat counts wall time, however fast
+            # the motion runs.
             speed = 1.0 if dialogue == "heartbeat" else 3.0
             process = closed.enter_context(closing(StageProcess(tmp_path, "pc", speed)))
             driver = PortDriver(str(process.link), speed)

@@ -73,7 +73,7 @@ def test_every_damaged_line_is_refused_and_moves_nothing(talker):
         assert talker.send_command(verb, *args).kind == "ok"
 
 
-# Bytes that are sent in one piece; chosen.
+# Bytes that are sent in one piece
 CHUNK_BYTES = 4096
 
 

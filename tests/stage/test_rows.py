@@ -33,7 +33,7 @@ def list_rising(wires) -> list:
 
 
 def check_row(wires, *, x0: int, pitch: int, points: int, y: int, width_us: int):
-    """Check the laws that hold for every row, held or not, which are all but the even spacing.
+    """Check all laws of a row except the even spacing, which a held row does not have.
 
     Returns the rising edges of the triggers.
     """
@@ -85,7 +85,7 @@ def test_random_rows_have_a_trigger_at_each_point_evenly_in_time(stage, seed: in
         sign = 1 if pitch > 0 else -1
         assert all(m.vx_um_s == sign * rate * UM for m in cruise)
         assert cruise[0].x_um == (x0 - pitch) * UM
-        # At rest the reported motion is where the stage says it is.
+        # At rest the reported motion has the position that the stage reports.
         last = list_motions(wires)[-1]
         assert (last.vx_um_s, last.x_um, last.y_um) == (0, done.integer("x") * UM, y * UM)
     done, wires = stage.run_motion("MOVE", 0, 0, 10_000)
@@ -135,10 +135,10 @@ def test_ramps_keep_to_the_acceleration(stage, accel: int):
     _, wires = stage.run_motion("MOVE", distance, 20_000, rate)
     speeds = {m.t_ns: m.vx_um_s / UM for m in list_motions(wires) if m.vx_um_s > 0}
     for (t0, v0), (t1, v1) in itertools.pairwise(speeds.items()):
-        # Chosen: 10 per cent and 5 steps/s more, as the speed changes by whole timer ticks.
+        # The speed changes by whole timer ticks: 10 per cent and 5 steps/s more are allowed.
         assert abs(v1 - v0) <= 1.1 * accel * (t1 - t0) * 1e-9 + 5
     assert max(speeds.values()) == rate
-    # The speed over time is a trapezium: the distance at full speed takes its time, and the two ramps that of one more.
+    # The speed over time is a trapezium: the two ramps add the time of one ramp to that of the distance at full speed.
     duration_s = (wires[-1].t_ns - wires[0].t_ns) * 1e-9
     assert duration_s == pytest.approx(distance / rate + rate / accel, rel=0.02)
 
@@ -147,7 +147,7 @@ def test_stop_ends_the_triggers_and_keeps_the_position(stage):
     stage.prepare()
     stage.wires.clear()
     assert stage.send_command("ROW", 20_000, 400, 50, 0, 4000).kind == "ok"
-    # The way to the row takes some 5 s, and the row as long.
+    # The stage reaches the row after some 5 s, and the row takes as long.
     stage.run_ms(5_500)
     triggers_before_stop = len(list_rising(stage.wires))
     assert 0 < triggers_before_stop < 50
@@ -167,8 +167,8 @@ def test_stop_ends_the_triggers_and_keeps_the_position(stage):
 def _draw_action(rng: random.Random, sequence: int) -> tuple[str, object]:
     """Draw something to do with a stage: the name of a driver's method, and its arguments.
 
-    How often each is drawn, and its ranges, are chosen. Some commands are drawn twice, so that the stage is homed and
-    enabled for much of the time; some arguments are outside of the travel.
+    Some commands are drawn twice, so that the stage is homed and enabled for much of the time; some arguments are
+    outside of the travel.
     """
     weights = {"command": 40, "byte": 15, "run": 30, "rest": 10, "press": 2, "slip": 2, "reset": 1}
     (kind,) = rng.choices(list(weights), list(weights.values()))

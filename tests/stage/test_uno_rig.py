@@ -16,7 +16,7 @@ from polysight_shared.errors import ConfigError
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import load_scene, simulate
 
-# Time after which the scan counts as hung; chosen, many times what it takes.
+# Time after which the scan counts as hung: many times as long as it takes
 LIMIT_S = 200
 SIMULATED_RIG = ("python", "-m", "polysight_simulators.rig")
 SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm = [60.0, 60.0]\nmetal = true\n'

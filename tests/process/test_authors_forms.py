@@ -15,13 +15,13 @@ from polysight.store.open import open_source
 from polysight.store.published import PublishedCubes
 from polysight.sync.cubes import detect_form
 from polysight_shared.config import Image
-from polysight_shared.errors import ErrorCode
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import decode_scene, simulate, write_cube
 
 RIG = load_published_rig()
 # The rig with an image of few pixels, which is formed quickly.
-SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))
+RIG_WITH_SMALL_IMAGE = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))
 SCENE = {
     "name": "two plates",
     "grid": {"columns": 17, "rows": 21, "step_x_mm": 16.0, "step_y_mm": 8.0},
@@ -35,7 +35,7 @@ SCENE = {
 
 def read_images(folder):
     """Return both images of a recording, and its pipeline."""
-    pipeline = make_pipeline(open_source(folder, SMALL))
+    pipeline = make_pipeline(open_source(folder, RIG_WITH_SMALL_IMAGE))
     return pipeline.form_images(), pipeline
 
 
@@ -64,7 +64,7 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(undisturbed_images, tm
     assert image.h.shape == undisturbed_images.h.shape == (50, 60)
     np.testing.assert_allclose(image.x_m, undisturbed_images.x_m, atol=1e-12)
     np.testing.assert_allclose(image.y_m, undisturbed_images.y_m, atol=1e-12)
-    # All disturbances and lost packets leave 2 %; chosen.
+    # Noise, the disturbances and lost packets leave a correlation of 0.992 and 0.997.
     for channel in ("h", "v"):
         assert correlate(image, undisturbed_images, channel) > 0.98
     facts = pipeline.quality.notes["recording"]
@@ -81,6 +81,7 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(undisturbed_images, tm
 def test_a_synchronised_cube_of_any_convention_makes_the_same_image(undisturbed_images, tmp_path, form):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path, **form)
     image, pipeline = read_images(folder)
+    # The correlation is 0.9999.
     for channel in ("h", "v"):
         assert correlate(image, undisturbed_images, channel) > 0.999
     assert set(pipeline.quality.notes["recording"].cubes) == {"RH", "RV"}
@@ -97,7 +98,7 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
         file = folder / f"{board}_synced.npy"
         cube = np.load(file)
         phase_turns = rng.uniform(0, 1, cube.shape[1:3])
-        # Delays of 40 to 60 of the 256 bins of the range transform: chosen, far from its ends
+        # Delays of 40 to 60 of the 256 bins of the range transform, far from its ends
         range_bins = rng.uniform(40, 60, cube.shape[1:3])
         part_of_chirp = np.arange(256) / 256
         turns = phase_turns[..., None] + range_bins[..., None] * part_of_chirp
@@ -106,6 +107,7 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
         cube[:, 5, 6] = np.nan
         np.save(file, cube)
     image, pipeline = read_images(folder)
+    # Two masked positions of 17 x 21 leave 0.996. Positions with their random phases would not be correlated at all.
     for channel in ("h", "v"):
         assert correlate(image, undisturbed_images, channel) > 0.99
     assert pipeline.quality.result().boards["RH"].positions_masked == 2
@@ -113,7 +115,7 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
 
 def test_a_cube_of_zeros_is_refused(tmp_path):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
-    source = open_source(folder, SMALL)
+    source = open_source(folder, RIG_WITH_SMALL_IMAGE)
     assert isinstance(source, PublishedCubes)
     with expect_refusal(ErrorCode.NO_DATA):
         detect_form([0 * source.read_row("RH", 0).cube], source.instrument, source.instrument.receivers[0])
@@ -122,10 +124,11 @@ def test_a_cube_of_zeros_is_refused(tmp_path):
 def test_cubes_are_processed_like_any_scan_but_have_no_sync_report(tmp_path):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
     config = tmp_path / "rig.toml"
-    config.write_bytes(tomli_w.dumps(to_builtins(SMALL)).encode())
+    config.write_bytes(tomli_w.dumps(to_builtins(RIG_WITH_SMALL_IMAGE)).encode())
     assert main(["process", str(folder), "--out", str(tmp_path / "out"), "--config", str(config)]) == 0
     assert len(json.loads((tmp_path / "out" / "materials.json").read_text())["segments"]) == 2
     quality = json.loads((tmp_path / "out" / "quality.json").read_text())
     assert quality["boards"]["RH"]["positions"] == 17 * 21
     assert set(quality["recording"]["cubes"]) == {"RH", "RV"}
-    assert main(["sync-report", str(folder), "--out", str(tmp_path / "sync"), "--config", str(config)]) == 3
+    status = main(["sync-report", str(folder), "--out", str(tmp_path / "sync"), "--config", str(config)])
+    assert status == DataError.exit_status

@@ -1,4 +1,7 @@
-"""An RX without a signal is left out of synchronisation and images, and the verdict reports that and nothing wrong."""
+"""An RX without a signal is left out of synchronisation and images.
+
+The verdict reports that RX and gives no other reason, and the permittivities are still right.
+"""
 
 from dataclasses import replace
 
@@ -18,6 +21,9 @@ from polysight.store import CubeRow, RowData, ScanFolder
 from polysight.store.source import split_pieces
 from polysight.sync import RowSynchroniser
 from polysight_simulators.scene import decode_scene
+
+# Squared distance of a true permittivity from its estimate that is three standard deviations
+THREE_STDS_SQUARED = 3.0**2
 
 
 def draw_noise(row: int, words: np.ndarray, rms: float) -> np.ndarray:
@@ -94,10 +100,9 @@ def test_noise_instead_of_an_rx_is_reported_and_changes_nothing_else(source, pro
     assert f"RX{rx} of {board}" in reason
     assert list_other_reasons(findings) <= list_other_reasons(healthy)
     assert len(compute_distances(source, findings)) == len(PLATES)
-    # Each true permittivity is within three standard deviations.
-    assert max(compute_distances(source, findings)) < 9
+    assert max(compute_distances(source, findings)) < THREE_STDS_SQUARED
     assert pipeline.quality.result().boards[board].dead_rx == {rx: list(range(ROWS))}
-    # The images are nearly those of all RX.
+    # The images are nearly those of all RX: three of four RX have a correlation of 0.9998 or more with them.
     in_both_images = images.valid & healthy_images.valid
     for image, healthy_image in ((images.h, healthy_images.h), (images.v, healthy_images.v)):
         pixels = image[in_both_images]
@@ -153,7 +158,7 @@ def test_an_rx_that_dies_within_the_scan_is_left_out(source, process, rows):
     assert "first in row 16" in reason
     assert pipeline.quality.result().boards["RV"].dead_rx == {4: list(rows)}
     assert list_other_reasons(findings) <= list_other_reasons(process()[2])
-    assert max(compute_distances(source, findings)) < 9
+    assert max(compute_distances(source, findings)) < THREE_STDS_SQUARED
 
 
 @pytest.mark.parametrize("positions", [slice(38, None), slice(21, 27), slice(0, 5), slice(24, None)], ids=str)
@@ -179,7 +184,7 @@ def test_with_two_dead_rx_of_a_board_the_permittivities_are_still_right(source, 
     _, _, findings = process(kill("RH", 2, 3))
     assert len(list_reasons_about_rx(findings)) == 1
     assert list_other_reasons(findings) <= list_other_reasons(process()[2])
-    assert max(compute_distances(source, findings)) < 9
+    assert max(compute_distances(source, findings)) < THREE_STDS_SQUARED
 
 
 def test_a_board_without_any_rx_is_refused(process):
@@ -223,4 +228,4 @@ def test_a_dead_rx_in_a_cube_is_reported_like_one_in_rows(process, rms):
     assert "RX4 of RV" in reason
     assert list_other_reasons(findings) <= list_other_reasons(healthy)
     assert len(compute_distances(cubes, findings)) == len(PLATES)
-    assert max(compute_distances(cubes, findings)) < 9
+    assert max(compute_distances(cubes, findings)) < THREE_STDS_SQUARED

@@ -1,4 +1,4 @@
-"""The shipped demo, tilted and rippled plates before a table, keeps the result that README states."""
+"""The shipped demo, of tilted and uneven plates before a table, has the result that README states."""
 
 from benchmarks.coverage import Cubes
 from tests.support.paths import EXAMPLES
@@ -32,4 +32,4 @@ def test_each_plate_of_the_demo_has_a_permittivity_and_half_of_them_their_names(
         assert patch_result.permittivity.value is not None
         right_names += patch_result.patch_name is not None and patch_result.patch_name.name == plate.name
     assert dielectrics == 8
-    assert right_names >= 4
+    assert right_names >= dielectrics / 2

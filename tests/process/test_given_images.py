@@ -19,7 +19,7 @@ from polysight.materials import Labels, Library
 from polysight.process import Inputs, analyse_given_images, read_given_images
 from polysight.products import ProcessedScan, write_image, write_json
 from polysight.settings import Settings
-from polysight_shared.errors import ErrorCode, PolysightError
+from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 ANGLE = 55.0
 MATERIALS = {
@@ -73,7 +73,7 @@ def list_permittivities(scan):
 
 
 def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, save_images, rig):
-    """The folder contains boxes and has its top row first; the file does not."""
+    """Only the folder has boxes, and only its images begin with the top row."""
     by_folder = analyse_file(labels_folder, rig)
     by_file = analyse_file(save_images(), rig)
     assert {s.box for s in by_folder.segments} == set(BOXES)
@@ -84,6 +84,7 @@ def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, sav
         nearest = min(of_file, key=lambda place: np.hypot(place[0] - x, place[1] - y))
         assert np.hypot(nearest[0] - x, nearest[1] - y) < 5
         assert (permittivity is None) == (of_file[nearest] is None)
+        # A box and a patch of one plate differ in their pixels, which scatter.
         if permittivity is not None:
             assert permittivity.real == pytest.approx(of_file[nearest].real, rel=0.05)
 
@@ -101,6 +102,7 @@ def test_permittivities_are_those_of_the_plates(labels_folder, rig):
         if estimate is not None:
             true = MATERIALS[segment.box].permittivity
             error = abs(complex(estimate.real, estimate.imag) - true)
+            # Wrong by a fifth is another material; and three standard deviations of both parts together.
             assert error < 0.2 * abs(true)
             assert error < 3 * np.hypot(estimate.real_std, estimate.imag_std)
 
@@ -117,7 +119,7 @@ def test_images_with_axes_that_fall_have_the_same_results(save_images, pair, rig
     assert rising.images.x_m[0] == 1.3
 
 
-def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(save_images, rig):
+def test_the_option_for_the_angle_precedes_the_file_and_the_file_precedes_the_rig(save_images, rig):
     with_angle = save_images()
     without_angle = save_images("bare", incidence_deg=None)
     # The published rig has 54.9 degrees.
@@ -127,13 +129,14 @@ def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(save
         (without_angle, None, 54.9, "rig file"),
     ):
         scan = analyse_file(path, rig, incidence_deg=option)
+        # Angles are compared to a tenth of a degree, as they are written above.
         assert scan.quality.incidence.one_deg == pytest.approx(expected_deg, abs=0.05)
         assert scan.quality.given_images.incidence_from == source
         assert {round(s.incidence_deg, 1) for s in scan.segments} == {round(scan.quality.incidence.one_deg, 1)}
 
 
 @pytest.mark.parametrize("text", ["plates, incidence 60 deg", "no angle", ""])
-def test_the_angle_in_the_description_of_a_labels_folder_comes_before_the_rigs(labels_folder, tmp_path, rig, text):
+def test_the_angle_in_the_description_of_a_labels_folder_precedes_that_of_the_rig(labels_folder, tmp_path, rig, text):
     folder = Path(shutil.copytree(labels_folder, tmp_path / "plates"))
     file = folder / "plates.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"description": text}))
@@ -290,7 +293,9 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
         for before, after in zip(level.segments, rising.segments, strict=True)
         if before.tilt_across_deg is not UNSET and after.tilt_across_deg is not UNSET
     ]
+    # At least three of the five plates have a tilt in both results.
     assert len(changes) >= 3
+    # A sixteenth of the tilt
     assert np.median(changes) == pytest.approx(degrees[1], abs=0.05)
 
 
@@ -363,7 +368,7 @@ def test_the_published_picture_has_nine_plates_and_copper_is_the_reference(rig, 
 
 @pytest.mark.parametrize("has_scan_file", [True, False], ids=["with scan.json", "alone"])
 def test_images_of_a_simulated_scan_are_reported_as_simulated(tmp_path, rig, pair, has_scan_file):
-    """Earlier releases wrote this into scan.json only."""
+    """Images of this release say so themselves; those of earlier ones have it in scan.json of their folder only."""
     name = "image.npz" if has_scan_file else "copy.npz"
     axis_m = 0.002 * (np.arange(len(pair["h"])) - len(pair["h"]) / 2)
     images = Images(pair["h"], pair["v"], axis_m, axis_m, np.ones(pair["h"].shape, bool), pair["h"] / pair["v"])
@@ -377,7 +382,7 @@ def test_images_of_a_simulated_scan_are_reported_as_simulated(tmp_path, rig, pai
 
 def test_train_on_published_images_says_to_process_them_first(labels_folder, tmp_path, capsys):
     """The advice is not to label the folder itself, which `polysight label` refuses."""
-    assert main(["train", str(labels_folder), "--out", str(tmp_path / "own.npz")]) == 3
+    assert main(["train", str(labels_folder), "--out", str(tmp_path / "own.npz")]) == DataError.exit_status
     err = capsys.readouterr().err
     assert f"do: polysight process {labels_folder} --out out/{labels_folder.name}" in err
     assert f"polysight label {labels_folder}" not in err

@@ -47,7 +47,7 @@ def test_the_image_is_written_before_anything_is_derived_from_it(
         return finish(self, *words)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Pipeline, "finish", finish_scan)
-    assert main(["process", str(scan), "--out", str(tmp_path / "out")]) in (0, 5)
+    assert main(["process", str(scan), "--out", str(tmp_path / "out")]) == 0
     assert image_was_written == [True]
     assert str(tmp_path / "out" / "image.npz") in capsys.readouterr().err
     assert (tmp_path / "out" / "report.html").exists()
@@ -73,6 +73,7 @@ def test_images_published_during_a_scan_are_those_of_all_rows_together(scan: Pat
     publish_images(pipeline, tmp_path)
     published = read_products(tmp_path)
     images = pipeline.form_images()
+    # All pixels agree here.
     assert (published.valid == images.valid).mean() > 0.999
     valid_in_both = published.valid & images.valid
     for published_image, image in ((published.h, images.h), (published.v, images.v)):

@@ -116,7 +116,7 @@ def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(ThreadPoolExecutor, "shutdown", stop)
     with expect_refusal(ErrorCode.NO_DATA, "row 0"):
         list(map_rows(add, range(1000), threads=2))
-    assert len(begun) <= 3
+    assert len(begun) <= 2 + 1
 
 
 def test_samples_with_sub_bands_can_be_used_without_them(expected_images: Images, scan: Path) -> None:
@@ -145,7 +145,7 @@ def test_other_planes_and_grids_come_from_the_same_samples(
     pairs = [(reprocessed.h_raw, expected.h_raw), (reprocessed.v_raw, expected.v_raw)]
     pairs += zip(reprocessed.illumination.footprints, expected.illumination.footprints, strict=True)
     for from_samples, from_raw_data in pairs:
-        # The gates differ, and with them the noise.
+        # The ranges of paths that are kept differ, and with them the noise.
         assert np.abs(from_samples - from_raw_data).max() < 2e-3 * np.abs(from_raw_data).max()
 
 

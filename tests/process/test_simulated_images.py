@@ -15,7 +15,7 @@ from polysight.process.given_images import _is_simulated_product
         ("image.npz", {}, False),
         ("image.npz", [True], False),
         ("image.npz", None, False),
-        # Of another program's file, the scan beside it says nothing.
+        # A scan.json in its folder does not describe a file of another program.
         ("mine.npz", {"simulated": True}, False),
     ],
 )

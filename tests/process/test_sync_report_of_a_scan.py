@@ -37,10 +37,10 @@ def scan(make_scan, tmp_path_factory):
     )
     head = make_header("hpf", [SourceScan("sweep", "sweep", True, 3)])
     path = write_calibration(FilterFile(**head, boards={"RH": true_filter, "RV": true_filter}), folder / "calibration")
-    true = make_rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
+    true_rig = make_rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     scene_changes = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
     scan = make_scan(
-        folder / "scan", make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **scene_changes), true
+        folder / "scan", make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **scene_changes), true_rig
     )
     _believe_programmed(scan)
     return scan
@@ -54,8 +54,9 @@ def _believe_programmed(scan):
 
 
 def test_a_scan_with_two_antennas_has_a_report_and_an_image(make_scan, tmp_path):
-    two = make_rig_with(antennas={"rx_mm": load_rig_table()["antennas"]["rx_mm"][:2]})
-    scan = make_scan(tmp_path / "scan", make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES), two)
+    rig_with_two_rx = make_rig_with(antennas={"rx_mm": load_rig_table()["antennas"]["rx_mm"][:2]})
+    scene = make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES)
+    scan = make_scan(tmp_path / "scan", scene, rig_with_two_rx)
     read_output("sync-report", scan, "--out", tmp_path / "report")
     read_output("image", scan, "--out", tmp_path / "image")
     assert (tmp_path / "report" / "sync.json").exists()
@@ -83,8 +84,10 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
         # What is left is noise, once the filter's true response is taken out: its slope would turn frequency into
         # amplitude.
         for stage in ("aligned", "averaged", "referenced"):
-            assert stages[stage]["amplitude_std"] < 0.004
-            assert stages[stage]["phase_rad_std"] < 1.5 * stages[stage]["phase_rad_bound"] < 0.01
+            figures_of_stage = stages[stage]
+            assert figures_of_stage["amplitude_std"] < 0.004
+            assert figures_of_stage["phase_rad_std"] < 1.5 * figures_of_stage["phase_rad_bound"]
+            assert 1.5 * figures_of_stage["phase_rad_bound"] < 0.01
         for stage, values in quality["boards"][name]["synchronisation"].items():
             expected = {NAMES[k]: v for k, v in stages[stage].items() if k in NAMES}
             assert values == pytest.approx(expected, rel=1e-9)

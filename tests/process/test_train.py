@@ -43,6 +43,7 @@ def test_scans_and_their_scenes_give_the_same_library(make_scan, rig_file, tmp_p
     entries_of_scene = [entry for entry in library.entries if entry.scan == "second"]
     for of_scan, of_scene in zip(entries_of_scan, entries_of_scene, strict=True):
         assert of_scan.simulated
+        # Pixels of a patch
         assert of_scan.h.size >= 10
         for key in ("h", "v", "p"):
             np.testing.assert_array_equal(getattr(of_scan, key), getattr(of_scene, key))

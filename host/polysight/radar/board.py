@@ -98,8 +98,7 @@ class BringUp:
         self._link = board.link
         # Reported errors that are ignored, because healthy boards report them, too.
         self._ignored: list[str] = []
-        # Remedy for the last boot status: "firmware" (the flash has none), "hardware" (replace the board), or "" for
-        # none.
+        # Remedy for the last boot status: "firmware" (the flash has none), "hardware" (replace the board), "" (none).
         self._cure = ""
         # The main core's patch before anything was downloaded.
         self._flash_patch = ""

@@ -136,6 +136,7 @@ def test_the_demo_scene_is_named_right_and_its_permittivities_found(image_scene)
     assert len(right_names) >= 7
     assert pixel_accuracy(result) > 0.85
     assert result.metal.certain
+    # The real parts are wrong by up to 2.5 % (acrylic).
     for p in result.patches:
         if p.truth.metal:
             assert p.permittivity.value is None

@@ -1,4 +1,4 @@
-"""Opening the USB chip with the real pyftdi on a simulated bus: modes, replug, late plug, short reads, paths."""
+"""The real pyftdi opens the USB chips of boards on a simulated bus, also if they were unplugged or plugged in late."""
 
 import errno
 import sys
@@ -79,7 +79,7 @@ def test_slow_mode_is_one_word_a_transfer(plugged_chip):
 
 
 def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged_chip):
-    """pyftdi opens any of the chips when given a bus address alone, in the order of a set."""
+    """With a bus address alone pyftdi would open any of these chips."""
     other_chips = [make_chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
     for other_chip in other_chips:
         bus.plug(other_chip)
@@ -119,7 +119,7 @@ def test_a_missing_chip_is_an_error_with_its_serial_number():
 
 
 def test_a_chip_that_is_plugged_in_later_is_found(bus, board):
-    """pyftdi caches what it has enumerated, also an empty bus."""
+    """pyftdi keeps the list of chips that it has found, even an empty one."""
     with pytest.raises(DeviceError):
         open_usb("FT7")
     bus.plug(make_chip(board, "FT7"))
@@ -162,11 +162,13 @@ def test_a_chip_that_is_unplugged_while_it_is_opened_can_be_opened_later(bus, pl
 
 
 def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
-    native = enumerate(rig.radar.native.values(), 1)
-    boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image(), die_number=k) for k, n in native}
-    chips = {place: make_chip(b, place, (n,)) for n, (place, b) in enumerate(boards.items(), 1)}
-    for usb_chip in chips.values():
-        bus.plug(usb_chip)
+    boards = {}
+    chips = {}
+    for number, native in enumerate(rig.radar.native.values(), 1):
+        board = RadarBoard(lambda: clock.time, flash=make_image(), die_number=number)
+        boards[native.place] = board
+        chips[native.place] = make_chip(board, serial=native.place, path=(number,))
+        bus.plug(chips[native.place])
 
     def row(radars: NativeRadars) -> set[RadarState]:
         radars.arm(FRAMES)

@@ -1,4 +1,4 @@
-"""Each named constraint: it holds for the published chirp, and is broken and named by a value outside it."""
+"""Each constraint of the radar holds for the published chirp, and is named when a value of the rig file breaks it."""
 
 import math
 import re
@@ -15,7 +15,7 @@ from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.geometry import direct_path_m
 
 # Frames of a row: 350 positions with 16 pulses each.
-FRAMES = 5600
+FRAMES = 350 * 16
 
 
 def change_rig(rig: Instrument, table: str, **values) -> Instrument:
@@ -86,10 +86,16 @@ def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name
 
 
 def test_the_lowest_start_frequency_is_the_lowest_code_of_the_radar(rig):
-    """The ICD's lowest code, 0x5471C71B, stands for a little less than 76 GHz: code x 3.6 GHz / 2^26."""
+    """The lowest code of TI's interface control document stands for a little less than 76 GHz."""
+    lowest_code = 0x5471C71B
+    hz_per_code = 3.6e9 / 2**26
     transmitter = msgspec.structs.replace(rig.transmitter, start_offset_hz=0.0)
-    for start, holds in ((76e9, True), (0x5471C71B * 3.6e9 / 2**26, True), (0x5471C71A * 3.6e9 / 2**26, False)):
-        changed_rig = change_rig(rig, "chirp", start_hz=start)
+    for start_hz, holds in (
+        (76e9, True),
+        (lowest_code * hz_per_code, True),
+        ((lowest_code - 1) * hz_per_code, False),
+    ):
+        changed_rig = change_rig(rig, "chirp", start_hz=start_hz)
         assert (f"start frequency of {transmitter.name}" not in list_broken_constraints(changed_rig)) is holds
 
 
@@ -220,13 +226,14 @@ def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):
     result = next(c for c in list_constraints(changed_rig, FRAMES) if c.name == "IF budget of RH")
     offset = float(re.findall(r"[\d.]+", result.remedy)[-1])
     changed_rig = change_receiver(rig, start_offset_hz=offset)
-    # 0.45 of the sample rate; codes of frequencies are 53.6 Hz wide.
-    expected_hz = pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
-    assert direct_if_hz(changed_rig, changed_rig.by_name("RH")) == expected_hz
+    middle_of_band_hz = 0.45 * rig.chirp.sample_rate_hz
+    found_hz = direct_if_hz(changed_rig, changed_rig.by_name("RH"))
+    # Frequencies are rounded to codes of 53.6 Hz.
+    assert found_hz == pytest.approx(middle_of_band_hz, abs=60.0)
 
 
-def test_every_constraint_is_tested(rig):
-    # The cases of that test, and constraints with a test of their own.
+def test_every_constraint_has_a_test(rig):
+    # The cases of the test above, and constraints with a test of their own
     tested = set()
     for mark in test_a_broken_constraint_is_reported_with_formula_limits_and_value.pytestmark:
         tested |= {name for name, *_ in mark.args[1]}

@@ -231,7 +231,7 @@ class Figures:
     @classmethod
     def of_numpy(cls, chain: Chain, samples: NDArray[np.complex64]) -> Figures:
         """Measure NumPy on this core."""
-        spectral.forget()
+        spectral.clear_cache()
         seconds = {
             "first image": wall_seconds(lambda: chain.image(samples), 1),
             "image": wall_seconds(lambda: chain.image(samples), FEW_ROUNDS),
@@ -255,7 +255,7 @@ class Figures:
             return library.to_numpy(chain.image(put(), xp, device))
 
         def first() -> Image:
-            spectral.forget()
+            spectral.clear_cache()
             return from_samples()
 
         def exact() -> Image:

@@ -90,7 +90,7 @@ class Bench:
 
     def ours_cold(self) -> Image:
         """Form the image as :func:`ours`, without any stored kernel."""
-        spectral.forget()
+        spectral.clear_cache()
         return self.ours()
 
     def theirs(self, points: int = SETTINGS[0]) -> Image:

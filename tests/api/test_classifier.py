@@ -57,7 +57,7 @@ def test_the_paper_s_classifier_gives_the_names_of_the_model_in_libraries(librar
     model = PaperKnn(weights=weights).fit(samples)
     knn = PaperKNeighborsClassifier(n_neighbors=5, weight_h=0.7, weight_v=1.3, measure="inverse")
     knn.fit(invert_ratios(samples.x), samples.names)
-    names, *_ = model.by_pixel(invert_ratios(pixels))
+    names, *_ = model.classify_pixels(invert_ratios(pixels))
     # They need not break a tie between materials in the same way; here all 30 names are equal.
     assert (knn.predict(pixels) == names).mean() > 0.99
 

@@ -9,7 +9,7 @@ from polysight.imaging import image_grid
 from polysight.imaging.direct import DirectImager
 from polysight.imaging.geometry import Antennas, Aperture, find_irregularity, find_scene_gate_m, scan_offsets_m
 from polysight.imaging.samples import choose_imager, reduction
-from polysight.imaging.spectral import KEEP_BYTES, IncrementalImager, SpectralImager, forget, get_cached
+from polysight.imaging.spectral import KEEP_BYTES, IncrementalImager, SpectralImager, clear_cache, get_cached
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -150,7 +150,7 @@ def test_kernels_computed_again_give_the_same_image(aperture):
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
     samples = _draw_samples(a, np.random.default_rng(6))
     warm = SpectralImager(a).image(samples)
-    forget()
+    clear_cache()
     np.testing.assert_array_equal(SpectralImager(a).image(samples), warm)
 
 
@@ -163,7 +163,7 @@ def test_two_imagers_used_alternately_give_the_images_that_each_gives_alone(aper
     weights = rng.uniform(0, 1, a.shape[2:]).astype(np.float32)
     alone = []
     for y, echo in zip(samples, echoes, strict=True):
-        forget()
+        clear_cache()
         alone.append((SpectralImager(a).image(y.copy()), SpectralImager(a).image_constant_echo(echo, weights)))
     imagers = [SpectralImager(a), SpectralImager(a)]
 
@@ -197,9 +197,9 @@ def small_cache():
         array = np.broadcast_to(np.complex64(0), (int(share * KEEP_BYTES / 8),))
         return get_cached((key,), lambda: keys.append(key) or array)
 
-    forget()
+    clear_cache()
     yield ask, keys
-    forget()
+    clear_cache()
 
 
 def test_kernels_are_kept_while_they_fit_and_the_least_recently_used_go_first(small_cache):

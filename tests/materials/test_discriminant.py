@@ -85,7 +85,7 @@ def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
     assert verdicts.names.tolist() == right_names
     assert moved_verdicts.names.tolist() == right_names
     # A model that looks at each pixel alone cannot estimate the error that all pixels of the scan share.
-    share_right_pixel_by_pixel = (model.by_pixel(moved)[0] == test.names).mean()
+    share_right_pixel_by_pixel = (model.classify_pixels(moved)[0] == test.names).mean()
     assert (moved_verdicts.pixel_names == test.names).mean() > share_right_pixel_by_pixel
 
 
@@ -101,7 +101,7 @@ def test_a_patch_alone_is_named_like_its_pixels_without_a_correction_of_its_scan
         alone = model.by_scan(test.x[of_patch], test.patches[of_patch])
         assert alone.patches.tolist() == [patch]
         assert alone.names[0] == test.names[of_patch][0]
-        assert alone.pixel_names.tolist() == model.by_pixel(test.x[of_patch])[0].tolist()
+        assert alone.pixel_names.tolist() == model.classify_pixels(test.x[of_patch])[0].tolist()
 
 
 def test_known_patches_are_called_unknown_at_the_stated_rate():

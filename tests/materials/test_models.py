@@ -164,7 +164,7 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
             self.name = samples.names[0]
             return self
 
-        def by_pixel(self, x):
+        def classify_pixels(self, x):
             test_pixel_was_known.append(any(row.tobytes() in self.known for row in x))
             return np.full(len(x), self.name), np.zeros(len(x))
 
@@ -234,7 +234,7 @@ def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
     queries = draw_samples(noise=0.02, seed=9)
     lambda_h, lambda_v = 3.0, 0.7
     our_model = PaperKnn(weights=Weights(lambda_h, lambda_v, 0.0, neighbours=7)).fit(data)
-    our_names, _ = our_model.by_pixel(queries.x)
+    our_names, _ = our_model.classify_pixels(queries.x)
     scale = [lambda_h, lambda_v]
     sklearn_model = KNeighborsClassifier(7, metric="manhattan").fit(data.x[:, :2] * scale, data.names)
     sklearn_names = sklearn_model.predict(queries.x[:, :2] * scale)

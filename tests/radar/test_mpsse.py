@@ -53,8 +53,8 @@ def test_a_stream_may_be_split_anywhere(words, data):
     chip = UsbChip(simulated.RadarBoard(lambda: 0.0))
     stream = encode_writes(words)
     cut = data.draw(st.integers(0, len(stream)))
-    chip.take("A", stream[:cut])
-    chip.take("A", stream[cut:])
+    chip.receive_from_host("A", stream[:cut])
+    chip.receive_from_host("A", stream[cut:])
     assert chip.words_written == words
 
 
@@ -63,21 +63,21 @@ def test_an_invalid_stream_is_detected(chip, byte):
     """The tests above rely on the simulated chip to report violations of the SPI protocol."""
     stream = bytearray(encode_writes([0x1234, 0x5678]))
     stream[byte] ^= 0x09
-    chip.take("A", bytes(stream))
+    chip.receive_from_host("A", bytes(stream))
     assert chip.errors or chip.words_written != [0x1234, 0x5678]
 
 
 def test_the_reset_is_released_in_functional_mode_only(board, chip):
     # Channel D selects the mode of the start, not the functional one here; channel C releases the reset.
-    chip.take("D", b"\x1c")
+    chip.receive_from_host("D", b"\x1c")
     for pins in (0x80, 0xC0):
-        chip.take("C", bytes((pins,)))
+        chip.receive_from_host("C", bytes((pins,)))
     assert not board.interrupt
     assert board.executed == []
 
 
 def test_an_answer_with_too_few_bytes_is_an_error(chip, usb, monkeypatch):
-    monkeypatch.setattr(chip, "give", lambda name, size: b"\0" * (size - 1))  # noqa: ARG005
+    monkeypatch.setattr(chip, "send_to_host", lambda name, size: b"\0" * (size - 1))  # noqa: ARG005
     with expect_refusal(ErrorCode.NO_ANSWER, "3 of 4 bytes"):
         usb.read(2)
     with expect_refusal(ErrorCode.NO_ANSWER):

@@ -106,7 +106,7 @@ class Lattice:
         return self.band / (self.size_x * self.pitch_x_m)
 
 
-def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
+def make_lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     """Return the lattice of a regular aperture, see :func:`polysight.imaging.geometry.find_irregularity`.
 
     Parameters
@@ -152,7 +152,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     )
 
 
-def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = None) -> Iterator[Any]:
+def list_delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = None) -> Iterator[Any]:
     """Yield the delay of the excess path for lags x [nx] and y [ny], float64 [ny, nx] in seconds, for each RX."""
     a = aperture.antennas
     z = float(aperture.grid.z_m) - float(aperture.offsets_m[0, 0, 2])
@@ -198,7 +198,7 @@ def _find_band(aperture: Aperture, first: float, last: float, step: float, colum
     fade = size - math.ceil((last - first) / step * finer) - 1
     x = first + np.arange(-fade, size) * step / finer
     spectrum = np.zeros(size)
-    for delay in delays_s(aperture, x, np.linspace(grid.y_m[0] - y.max(), grid.y_m[-1] - y.min(), 9)):
+    for delay in list_delays_s(aperture, x, np.linspace(grid.y_m[0] - y.max(), grid.y_m[-1] - y.min(), 9)):
         for f in aperture.frequencies_hz[[0, -1]]:
             # exp(-j 2 pi f delay)
             kernel = cross_fade(np, turn(np, delay * f, np.float64, np.complex128), size)
@@ -236,12 +236,12 @@ def _count_bytes(arrays: Any) -> int:
     return math.prod(getattr(arrays, "shape", (0,))) * 8
 
 
-def forget() -> None:
+def clear_cache() -> None:
     """Clear the cache."""
     _cache.clear()
 
 
-def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
+def make_lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
     """Return the cache key of a lattice."""
     a = aperture.antennas
     grid = aperture.grid
@@ -253,7 +253,7 @@ def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
     return ("lattice", slack_m, *heights, *sizes, *(n.tobytes() for n in numbers))
 
 
-def kernel_key(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:
+def make_kernel_key(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:
     """Return the cache key of kernels."""
     a = aperture.antennas
     grid = aperture.grid
@@ -267,7 +267,7 @@ def kernel_key(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tu
     )
 
 
-def spectra_along_x(aperture: Aperture, lattice: Lattice, lines: int, xp: Any = np, device: Any = None) -> Any:
+def compute_spectra_along_x(aperture: Aperture, lattice: Lattice, lines: int, xp: Any = np, device: Any = None) -> Any:
     """Return the spectra of the kernels along x in the band: complex64 [rx * frequency, lag y, k].
 
     The delays are computed once per RX. Frequencies are evenly spaced, so that each kernel is the one before times a
@@ -282,7 +282,7 @@ def spectra_along_x(aperture: Aperture, lattice: Lattice, lines: int, xp: Any = 
     runs = _list_runs(lattice.band % n)
     size = (len(aperture.antennas.rx_m) * f.size, lines, lattice.band.size)
     spectra = xp.zeros(size, dtype=xp.complex64, device=device)
-    for rx, delay in enumerate(delays_s(aperture, x, y, xp, device)):
+    for rx, delay in enumerate(list_delays_s(aperture, x, y, xp, device)):
         kernel = turn(xp, delay * float(f[0]), xp.float32, xp.complex64)
         phase_step = turn(xp, delay * step, xp.float32, xp.complex64)
         for m in range(f.size):
@@ -310,8 +310,8 @@ class RowSpectra:
         self.aperture = aperture
         self.xp = xp
         self.device = device
-        key = lattice_key(aperture, slack_m)
-        self.lattice: Lattice = get_cached(key, lambda: lattice(aperture, slack_m))
+        key = make_lattice_key(aperture, slack_m)
+        self.lattice: Lattice = get_cached(key, lambda: make_lattice(aperture, slack_m))
         # Columns in a period. The spectrum of rows repeats every `period` bins, so that it has each bin of the band.
         self.period = self.lattice.size_x // self.lattice.stride_x
         self._runs = _list_runs(self.lattice.band % self.period)
@@ -322,24 +322,24 @@ class RowSpectra:
     def _compute_waves_at_pixels(self) -> Any:
         lags_m = self.aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
         wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, lags_m)) / self.lattice.size_x
-        return self.put(wave.astype(np.complex64))
+        return self.move_to_device(wave.astype(np.complex64))
 
-    def put(self, array: Any) -> Any:
+    def move_to_device(self, array: Any) -> Any:
         """Copy a numpy array to the imager's device."""
         return self.xp.asarray(array, device=self.device)
 
-    def kernels(self, lines: int) -> Any:
+    def compute_kernels(self, lines: int) -> Any:
         """Return the kernels, padded with zeros to this number of lines, complex64 [rx * frequency, lag y, k]."""
-        return spectra_along_x(self.aperture, self.lattice, lines, self.xp, self.device)
+        return compute_spectra_along_x(self.aperture, self.lattice, lines, self.xp, self.device)
 
-    def key(self, *more: Any) -> tuple[Any, ...]:
+    def make_key(self, *more: Any) -> tuple[Any, ...]:
         """Return the cache key of an array made from the kernels."""
-        return (*more, *kernel_key(self.aperture, self.lattice, self.xp, self.device))
+        return (*more, *make_kernel_key(self.aperture, self.lattice, self.xp, self.device))
 
-    def ramps(self, starts_m: Any) -> Any:
+    def compute_ramps(self, starts_m: Any) -> Any:
         """Return phase ramps that shift rows to their starts, complex64 [row, k]."""
         cycles = np.outer(starts_m - self._origin, self.lattice.wavenumbers)
-        return self.put(np.exp(-2j * np.pi * cycles).astype(np.complex64))
+        return self.move_to_device(np.exp(-2j * np.pi * cycles).astype(np.complex64))
 
     def transform_rows(self, rows: Any, ramps: Any) -> Any:
         """Return the spectra of rows [..., row, column] in the kernel's band, [..., row, k]."""
@@ -381,12 +381,12 @@ class SpectralImager(RowSpectra):
 
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         super().__init__(aperture, xp, device, slack_m)
-        key = (xp.__name__, str(device), *lattice_key(aperture, slack_m))
-        self._ramps = get_cached(("ramps", *key), lambda: self.ramps(fit_row_starts_m(aperture.offsets_m)))
+        key = (xp.__name__, str(device), *make_lattice_key(aperture, slack_m))
+        self._ramps = get_cached(("ramps", *key), lambda: self.compute_ramps(fit_row_starts_m(aperture.offsets_m)))
         sizes = self.lattice
         # The last constant echo and the sum of the kernels for it; shared by all imagers with the same kernels, and
         # empty before the first echo.
-        self._echoes: list[tuple[Any, Any]] = get_cached(self.key("echo", sizes.size_y), list)
+        self._echoes: list[tuple[Any, Any]] = get_cached(self.make_key("echo", sizes.size_y), list)
         rows = aperture.offsets_m.shape[0]
         lines = aperture.grid.shape[0]
         # Lattice row of the first row of pixels.
@@ -398,12 +398,13 @@ class SpectralImager(RowSpectra):
         padded_lines = self.xp.zeros((count, pitch), dtype=self.xp.complex64, device=device)
         self._padded_lines = padded_lines[:, : sizes.band.size]
         # Rows are `row_stride` pitches apart: their spectrum along y repeats `row_stride` times in that of the lattice.
-        self._repeat = self.put(np.arange(sizes.size_y) % count)
+        self._repeat = self.move_to_device(np.arange(sizes.size_y) % count)
         # Lattice rows of positions, and of pixels.
-        self._rows = self.put(np.arange(rows) * sizes.row_stride)
-        self._pixel_rows = self.put(self._first_pixel_row + np.arange(lines) * sizes.pixel_stride)
+        self._rows = self.move_to_device(np.arange(rows) * sizes.row_stride)
+        self._pixel_rows = self.move_to_device(self._first_pixel_row + np.arange(lines) * sizes.pixel_stride)
         self._kernels = get_cached(
-            self.key("2d", sizes.size_y), lambda: transform_in_place(xp, self.kernels(sizes.size_y), axis=-2)
+            self.make_key("2d", sizes.size_y),
+            lambda: transform_in_place(xp, self.compute_kernels(sizes.size_y), axis=-2),
         )
 
     def image(self, samples: Any) -> Any:
@@ -519,7 +520,7 @@ class IncrementalImager(RowSpectra):
         # to all rows of pixels.
         self._first_pixel_row = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
-        self._kernels, self._components = get_cached(self.key("rows"), self._compute_principal_kernels)
+        self._kernels, self._components = get_cached(self.make_key("rows"), self._compute_principal_kernels)
         if echo is None:
             echo = np.zeros(aperture.shape[:2])
         self._clear(echo)
@@ -538,7 +539,7 @@ class IncrementalImager(RowSpectra):
         start_m
             Stage offset of the first column.
         """
-        ramp = self.ramps(np.array([start_m]))[0, :]
+        ramp = self.compute_ramps(np.array([start_m]))[0, :]
         weight_spectra = self.transform_rows(self.xp.astype(weights, self.xp.complex64), ramp)
         self.add_spectra(index, self.transform_rows(samples, ramp), weight_spectra)
 
@@ -557,7 +558,7 @@ class IncrementalImager(RowSpectra):
 
     def image_of_sum(self, factors: Any) -> Any:
         """Return the image of the rows so far, with a factor per RX [rx], complex64 [ny, nx]."""
-        total = self.xp.matmul(self._sum, self.put(np.asarray(factors, np.complex64))[:, None])[:, :, 0]
+        total = self.xp.matmul(self._sum, self.move_to_device(np.asarray(factors, np.complex64))[:, None])[:, :, 0]
         return self.evaluate_pixels(total.mT)
 
     def image_summed_constant_echo(self) -> Any:
@@ -582,7 +583,7 @@ class IncrementalImager(RowSpectra):
         xp = self.xp
         rx, m, rows, columns = self.aperture.shape
         lines = self.evaluate_pixels_adjoint(image).mT[:, :, None]
-        ramps = self.ramps(fit_row_starts_m(self.aperture.offsets_m))
+        ramps = self.compute_ramps(fit_row_starts_m(self.aperture.offsets_m))
         out = []
         for index in range(rows):
             # [k, component, ny] @ [k, ny, 1], then [k, channel, component] @ [k, component, 1]
@@ -624,7 +625,7 @@ class IncrementalImager(RowSpectra):
         channels = math.prod(self.aperture.shape[:2])
         kernels_by_k = xp.empty((lattice.band.size, lattice.lags_y, channels), dtype=xp.complex64, device=self.device)
         # The kernels are stored contiguously by k, so that products are fast.
-        kernels_by_k[...] = xp.permute_dims(self.kernels(lattice.lags_y), (2, 1, 0))
+        kernels_by_k[...] = xp.permute_dims(self.compute_kernels(lattice.lags_y), (2, 1, 0))
         powers = []
         bases = []
         for first in range(0, kernels_by_k.shape[0], _CHUNK):

@@ -154,7 +154,7 @@ class PaperKnn(Model):
         `x` features [n, columns], `patches` patch number [n]. A patch's distance is at least that to its material's
         distribution: beyond 1 its name does not hold, and the caller calls it unknown.
         """
-        voted = name_by_majority(*self.by_pixel(x), patches)
+        voted = name_by_majority(*self.classify_pixels(x), patches)
         distances = self.distributions.by_scan(x, patches).distances
         if distances is None:
             return voted
@@ -162,7 +162,7 @@ class PaperKnn(Model):
         distance_to_material = distances[np.arange(len(voted.patches)), material]
         return replace(voted, distance=np.maximum(voted.distance, distance_to_material))
 
-    def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
+    def classify_pixels(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Return each pixel's name [n], and its mean distance to its neighbours over the material's threshold [n]."""
         distance, nearest = self._knn.kneighbors(invert_ratios(x))
         votes = count_votes(self._material_of_pixel[nearest], self._materials.size)

@@ -209,7 +209,7 @@ class ErrorDiscriminant(Model):
         # Axes are a and b material, d and e feature.
         return np.sqrt(np.einsum("abd,abde,abe->ab", differences, inverse, differences))
 
-    def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
+    def classify_pixels(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return name, str [n], and distance over the threshold, float64 [n]."""
         distance2, cost = costs(self._compute_deviations(x) - self.level, self._compute_pixel_covariances())
         best = cost.argmin(axis=1)

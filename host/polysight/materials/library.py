@@ -551,7 +551,7 @@ class Model(ABC):
         """Fit the model to labelled pixels."""
 
     @abstractmethod
-    def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
+    def classify_pixels(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return name [n] and distance over the threshold [n]."""
 
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
@@ -559,7 +559,7 @@ class Model(ABC):
 
         By default a patch gets the name of most of its pixels.
         """
-        return name_by_majority(*self.by_pixel(x), patches)
+        return name_by_majority(*self.classify_pixels(x), patches)
 
 
 def name_by_majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:

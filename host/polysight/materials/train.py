@@ -503,7 +503,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
         learnt[test] = np.isin(samples.names[test], samples.names[train])
         model_of_fold = MODELS[model](channels)
         model_of_fold.fit(samples.take(train))
-        pixel_name[test], distance = model_of_fold.by_pixel(samples.x[test])
+        pixel_name[test], distance = model_of_fold.classify_pixels(samples.x[test])
         test_sets = [test]
         if model_of_fold.knows_scans:
             test_sets = [test[samples.groups[test] == group] for group in np.unique(samples.groups[test])]

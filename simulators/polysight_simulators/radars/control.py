@@ -76,7 +76,7 @@ class UsbChip:
         """Return one of the four channels."""
         return UsbChannel(self, name)
 
-    def take(self, name: str, data: bytes) -> None:
+    def receive_from_host(self, name: str, data: bytes) -> None:
         """Receive bytes from the host for a channel. Raises DeviceError if unplugged."""
         self._check()
         if name == "D":
@@ -101,7 +101,7 @@ class UsbChip:
                     return
                 del self._pending[name][:used_bytes]
 
-    def give(self, name: str, size: int) -> bytes:
+    def send_to_host(self, name: str, size: int) -> bytes:
         """Return up to `size` bytes of a channel for the host. Raises DeviceError if unplugged."""
         self._check()
         answer = bytes(self._answers[name][:size])
@@ -209,11 +209,11 @@ class UsbChannel:
 
     def write(self, data: bytes) -> None:
         """Send bytes."""
-        self._chip.take(self._name, data)
+        self._chip.receive_from_host(self._name, data)
 
     def read(self, size: int) -> bytes:
         """Receive up to `size` bytes."""
-        return self._chip.give(self._name, size)
+        return self._chip.send_to_host(self._name, size)
 
     def close(self) -> None:
         """Close the port."""
@@ -305,13 +305,13 @@ class RadarSocket(_Server):
             channel, operation, size = _HEAD.unpack_from(data)
             port = channel.decode("ascii")
             if operation == b"R":
-                answer = self.chip.give(port, size)
+                answer = self.chip.send_to_host(port, size)
                 client.sendall(struct.pack("<H", len(answer)) + answer)
                 data = data[_HEAD.size :]
                 continue
             if len(data) < _HEAD.size + size:
                 break
-            self.chip.take(port, data[_HEAD.size : _HEAD.size + size])
+            self.chip.receive_from_host(port, data[_HEAD.size : _HEAD.size + size])
             data = data[_HEAD.size + size :]
         return data
 

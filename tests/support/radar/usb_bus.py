@@ -171,7 +171,7 @@ class Bus(IBackend):
             chip.latency_ms[channel] = wValue
         elif bRequest == _RESET and wValue in (0, 1, 2):
             # All data that waits for the host is dropped.
-            chip.chip.give(_name_channel(channel), 1 << 20)
+            chip.chip.send_to_host(_name_channel(channel), 1 << 20)
         return len(data)
 
     def bulk_write(self, dev_handle, ep, intf, data, timeout) -> int:
@@ -182,14 +182,14 @@ class Bus(IBackend):
         mode, _ = chip.modes.get(channel, (0, 0))
         if mode != expected_mode:
             chip.errors.append(f"written to channel {channel} in mode {chip.modes.get(channel)}")
-        chip.chip.take(_name_channel(channel), bytes(data))
+        chip.chip.receive_from_host(_name_channel(channel), bytes(data))
         return len(data)
 
     def bulk_read(self, dev_handle, ep, intf, buff, timeout) -> int:
         chip = self._check(dev_handle)
         channel = (ep - 0x81) // 2 + 1
         max_bytes = min(self.packet, _PACKET_BYTES - len(_STATUS), len(buff) - len(_STATUS))
-        return self._fill(buff, _STATUS + chip.chip.give(_name_channel(channel), max_bytes))
+        return self._fill(buff, _STATUS + chip.chip.send_to_host(_name_channel(channel), max_bytes))
 
     def _check(self, dev) -> Chip:
         """Count a transfer, and return the chip of a handle; raises USBError if it has been unplugged."""

@@ -8,7 +8,7 @@ from tests.surfaces.test_paths import BEHIND, FRONT_M, add_sphere_echo, make_emp
 
 from polysight.surfaces import Samples
 from polysight.surfaces.paths import find_echoes, measure_echoes
-from polysight.surfaces.points import locate
+from polysight.surfaces.points import find_specular_points
 from polysight.surfaces.window import Echoes
 
 RADIUS_M = 0.06
@@ -27,7 +27,7 @@ def scan_two(apart_m: tuple[float, float, float], second: complex) -> tuple[Samp
 
 def find_owner(echoes: Echoes, scan: Samples, fronts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Distance of each echo's point from the surface of the nearer sphere, metres; and which sphere that is, 0 or 1."""
-    points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
+    points = find_specular_points(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
     distances_m = []
     for front in fronts:
         centre = front + RADIUS_M * BEHIND

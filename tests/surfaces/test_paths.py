@@ -18,7 +18,7 @@ from polysight.surfaces.points import (
     find_curvature,
     find_normals,
     find_offset_that_sees,
-    locate,
+    find_specular_points,
     predict_echo,
 )
 from polysight.surfaces.window import find_mirror_path
@@ -85,7 +85,7 @@ def test_a_sphere_is_found_with_points_normals_and_radius():
     radius_m = 0.12
     scan = add_sphere_echo(make_empty_scan(), FRONT_M, radius_m, amplitude=0.5 * np.exp(0.3j))
     echoes = find_echoes(scan, (1.4, 2.0))
-    points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
+    points = find_specular_points(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
     normals, _ = find_normals(points, echoes.at_m, scan.tx_m, scan.middle_m)
     bends = find_curvature(points, normals, echoes.at_m, scan.tx_m, scan.middle_m, echoes.bend)
     from_centre_m = points - (FRONT_M + radius_m * BEHIND)
@@ -103,7 +103,7 @@ def test_a_weak_echo_is_found_near_a_strong_one():
     mirror = add_mirror_echo(make_empty_scan(), z_m=0.65, amplitude=1.0)
     both = add_sphere_echo(mirror, FRONT_M, radius_m, amplitude=0.16)
     echoes = find_echoes(both, (1.4, 2.1))
-    points = locate(echoes.path_m, echoes.slope, echoes.at_m, both.tx_m, both.middle_m)
+    points = find_specular_points(echoes.path_m, echoes.slope, echoes.at_m, both.tx_m, both.middle_m)
     from_sphere_m = np.abs(np.linalg.norm(points - (FRONT_M + radius_m * BEHIND), axis=1) - radius_m)
     # One point of the sphere or more for each window
     windows = len(np.unique(echoes.at_m, axis=0))
@@ -121,7 +121,7 @@ def test_the_path_of_a_point_gives_the_point_back():
     bends = rng.uniform(-2, 15, (n, 2, 2))
     bends = (bends + np.swapaxes(bends, 1, 2)) / 2
     path, slope, bend = predict_echo(points, normals, bends, at_m, scan.tx_m, scan.middle_m)
-    assert np.allclose(locate(path, slope, at_m, scan.tx_m, scan.middle_m), points, atol=1e-8)
+    assert np.allclose(find_specular_points(path, slope, at_m, scan.tx_m, scan.middle_m), points, atol=1e-8)
     found_bends = find_curvature(points, normals, at_m, scan.tx_m, scan.middle_m, bend)
     # Curvatures are up to 15 / m and found to 5e-7 / m.
     assert np.allclose(found_bends, bends, atol=1e-4)

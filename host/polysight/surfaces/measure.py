@@ -26,7 +26,7 @@ from polysight.surfaces.points import (
     find_motion,
     find_normals,
     find_offset_that_sees,
-    locate,
+    find_specular_points,
     predict_echo,
 )
 from polysight.surfaces.window import WINDOW_M, Echoes, Samples
@@ -103,7 +103,7 @@ def find_shape(echoes: Echoes, optics: Optics) -> Shape:
     """Return places, normals and curvatures of H's echoes."""
     tx_m = optics.tx.at_m
     rx_m = optics.h.at_m
-    points = locate(echoes.path_m, echoes.slope, echoes.at_m, tx_m, rx_m)
+    points = find_specular_points(echoes.path_m, echoes.slope, echoes.at_m, tx_m, rx_m)
     normals, cos = find_normals(points, echoes.at_m, tx_m, rx_m)
     curvature = find_curvature(points, normals, echoes.at_m, tx_m, rx_m, echoes.bend)
     return Shape(points, normals, cos, curvature)

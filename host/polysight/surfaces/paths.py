@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.surfaces.joint import MERGED_WIDENING, START_BEND, JointFit
-from polysight.surfaces.points import compute_unit_legs, locate
+from polysight.surfaces.points import compute_unit_legs, find_specular_points
 from polysight.surfaces.window import (
     WINDOW_M,
     Array,
@@ -94,7 +94,7 @@ class _Search:
         path, gy, gx = np.meshgrid(self.paths, self.slopes, self.slopes, indexing="ij")
         slope = np.stack([gx.ravel(), gy.ravel()], axis=1)
         zero = np.zeros((slope.shape[0], 3))
-        points = locate(path.ravel(), slope, zero, board.tx_m, board.middle_m)
+        points = find_specular_points(path.ravel(), slope, zero, board.tx_m, board.middle_m)
         _, back, *_ = compute_unit_legs(points, zero, board.tx_m, board.middle_m)
         # `back` are unit vectors from the board's middle to the points: the path to an RX that lies p away from the
         # middle is shorter by back . p.

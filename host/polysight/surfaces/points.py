@@ -63,7 +63,7 @@ def compute_leg_bend(t: Array, r: Array, out_m: Array, back_m: Array) -> Array:
     return out + back
 
 
-def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
+def find_specular_points(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
     """Return the specular points [n, 3] of echoes with a path [n] and its slope [n, 2], by Newton's method."""
     points = at_m + (tx_m + rx_m) / 2
     points = points + np.stack(

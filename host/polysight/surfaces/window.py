@@ -21,7 +21,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.surfaces.points import compute_unit_legs, locate
+from polysight.surfaces.points import compute_unit_legs, find_specular_points
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Side of a window. Chosen: a larger one resolves echoes better and averages more, but in it the path over a curved
@@ -218,7 +218,7 @@ class BoardFit:
         metres; `slope` is [window, 2].
         """
         board = self.board
-        points = locate(path_m, slope, offsets, board.tx_m, board.middle_m)
+        points = find_specular_points(path_m, slope, offsets, board.tx_m, board.middle_m)
         _, back, *_ = compute_unit_legs(points, offsets, board.tx_m, board.middle_m)
         # `back` points from the RX to the echo's point: an RX displaced that way has a shorter path. [window, rx].
         excess = -back @ self.rx_places_m.T - board.direct_m

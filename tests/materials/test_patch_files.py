@@ -136,3 +136,19 @@ def test_a_file_whose_errors_are_of_fewer_patches_is_refused(synthetic, analyse_
     path.write_bytes(out.getvalue())
     with expect_refusal(ErrorCode.FILE_UNREADABLE, path):
         read_patches(path)
+
+
+@pytest.mark.parametrize("position_mm", [np.inf, np.nan])
+def test_a_file_with_a_position_that_is_not_finite_is_refused(synthetic, analyse_placement, tmp_path, position_mm):
+    """Otherwise the search for the same pixels in another scan would end in a ValueError."""
+    scene = synthetic(seed=3)
+    path = tmp_path / "patches.npz"
+    path.write_bytes(pack_patches(analyse_placement(1000), scene.x_m, scene.y_m, simulated=True))
+    with np.load(path) as z:
+        arrays = {k: z[k] for k in z}
+    places_mm = arrays["places_mm"].copy()
+    places_mm[0, 0] = position_mm
+    with path.open("wb") as file:
+        np.savez(file, **{**arrays, "places_mm": places_mm})
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, "not finite"):
+        read_patches(path)

@@ -182,6 +182,8 @@ def read_patches(path: Path) -> ScanPatches:
         ends = np.cumsum([0, *(int(r["pixels"]) for r in meta["patches"])])
         if features.shape != (ends[-1], 4) or places.shape != (ends[-1], 2):
             raise ValueError(f"arrays {places.shape}, {features.shape} for {ends[-1]} pixels")
+        if not np.isfinite(places).all():
+            raise ValueError("positions of pixels are not finite")
         patches = tuple(
             _read_patch(r, places[a:b], features[a:b]) for r, a, b in zip(meta["patches"], ends, ends[1:], strict=False)
         )

@@ -20,8 +20,21 @@ SOURCE_FOLDERS = ("host", "papers", "pi_controller", "shared", "simulators")
 PLACEHOLDER = "8"
 # A command in backticks.
 QUOTED_COMMAND = re.compile(r"`((?:sudo )?polysight(?:-pi)? [^`]+)`")
-# A command without backticks ends before the next plain word or the next punctuation mark.
-PLAIN_COMMAND = re.compile(r"(?<![`\w/-])(polysight(?:-pi)? [a-z][a-z-]+(?: (?![a-z]+\b)(?:[^;,:()`\s]|,(?=\S))+)*)")
+# A command without backticks, such as `polysight label SCAN --box A=1,2,3,4` in a sentence. It ends before the next
+# word of small letters and before the next punctuation mark; a comma within an argument is none.
+PLAIN_COMMAND = re.compile(
+    r"""
+    (?<![`\w/-])  # not in backticks, and no part of a longer name or of a path
+    (
+        polysight(?:-pi)?[ ][a-z][a-z-]+  # program and subcommand
+        (?:
+            [ ](?![a-z]+\b)  # the next argument is no word of small letters
+            (?:[^;,:()`\s]|,(?=\S))+
+        )*
+    )
+    """,
+    re.VERBOSE,
+)
 # Commands whose first argument is the name of an action, as in `polysight card test`.
 COMMANDS_WITH_ACTIONS = ("calibrate", "card", "radar")
 
@@ -37,6 +50,7 @@ def list_subcommands() -> set[str]:
 
 
 def list_sources() -> list[Path]:
+    """Source files; the folders `build` are none, because they contain copies from which wheels were built."""
     paths = []
     for folder in SOURCE_FOLDERS:
         paths += sorted((ROOT / folder).rglob("*.py"))
@@ -51,13 +65,14 @@ SOURCES = list_sources()
 def list_texts(path: Path) -> list[tuple[int, str]]:
     """Line number and text of each string in a file except docstrings; values of f-strings become PLACEHOLDER."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    # Docstrings; the parts of f-strings are added below, as they are not texts of their own.
+    # Nodes that are no texts of messages. First the docstrings: a string that is a statement of its own is one.
     excluded = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     texts = []
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             text = ""
             for part in node.values:
+                # Otherwise the walk, which comes to the parts later, would list each part as a text, too.
                 excluded.add(id(part))
                 text += str(part.value) if isinstance(part, ast.Constant) else PLACEHOLDER
             texts.append((node.lineno, text))
@@ -95,7 +110,7 @@ def test_commands_are_found_in_messages():
 
 
 def test_the_search_finds_the_commands_of_the_source_files():
-    """There are 287, of which 95 have arguments (measured); with far fewer the search would miss most of them."""
+    """The source files had 287 commands, 95 of them with arguments (measured): a broken search finds far fewer."""
     commands = []
     for path in SOURCES:
         for _, text in list_texts(path):
@@ -110,10 +125,10 @@ def test_every_command_in_a_message_exists_and_has_valid_options(path):
     for line, text in list_texts(path):
         for command in list_commands(text):
             # The word COMMAND in a message stands for any command, and dots for further arguments.
-            pasted = command.removesuffix("...").replace("COMMAND", "scan")
+            example = command.removesuffix("...").replace("COMMAND", "scan")
             if has_arguments(command):
-                faults_of_command = command_faults(pasted)
+                faults_of_command = command_faults(example)
             else:
-                faults_of_command = mention_faults(pasted)
+                faults_of_command = mention_faults(example)
             faults += [f"{path}:{line}: {command}: {fault}" for fault in faults_of_command]
     assert not faults, "\n".join(faults)

@@ -127,11 +127,14 @@ def test_the_host_s_own_folder_has_the_pipeline_and_its_settings_only():
 
 
 def list_rooms() -> list[Path]:
-    return sorted(p.parent for p in HOST.glob("*/__init__.py") if p.parent.name != "data")
+    """Folders of the rooms. `data` is none: it contains the rig file and the scenes of an installed package."""
+    folders = {file.parent for file in HOST.glob("*/__init__.py")}
+    return sorted(folders - {HOST / "data"})
 
 
 @pytest.mark.parametrize("room", list_rooms(), ids=lambda p: p.name)
-def test_the_front_of_each_room_describes_it_in_about_ten_lines(room):
+def test_the_front_of_each_room_describes_it_in_two_to_fourteen_lines(room):
+    """A title alone does not say what a room takes and returns; a longer text belongs on a page in docs."""
     tree = ast.parse((room / "__init__.py").read_text(encoding="utf-8"))
     docstring = ast.get_docstring(tree) or ""
     assert 2 <= len(docstring.splitlines()) <= 14, (
@@ -155,8 +158,11 @@ def list_host_and_papers() -> list[Path]:
     return [*HOST.rglob("*.py"), *PAPERS.rglob("*.py")]
 
 
-def test_a_room_s_modules_are_imported_by_the_room_only():
-    """Not `from polysight.sync.tone import find_tone` in another room: that name is imported from `polysight.sync`."""
+def test_other_rooms_import_names_from_the_front_of_a_room_and_not_from_its_modules():
+    """For example, other rooms may write `from polysight.sync import find_tone`.
+
+    They may not write `from polysight.sync.tone import find_tone`.
+    """
     forbidden_imports = []
     for file in list_host_and_papers():
         # The public interface `polysight` loads a module when one of its names is used.
@@ -171,8 +177,11 @@ def test_a_room_s_modules_are_imported_by_the_room_only():
     assert forbidden_imports == []
 
 
-def test_a_room_s_front_offers_only_the_modules_that_it_imports():
-    """Not `from polysight.sync import tone` in another room, unless the front imports `tone`; no relative imports."""
+def test_other_rooms_import_a_module_of_a_room_only_if_its_front_imports_it_too():
+    """For example, another room may write `from polysight.sync import tone` only if `sync/__init__.py` imports `tone`.
+
+    Relative imports are forbidden, because this test could not tell which room they name.
+    """
     forbidden_imports = []
     for file in list_host_and_papers():
         for line, dots, module, names in read_facts(file).imports:
@@ -194,7 +203,7 @@ def test_a_room_s_front_offers_only_the_modules_that_it_imports():
 
 
 def test_no_program_of_the_instrument_imports_the_simulators():
-    """The demo, too, starts them as programs: a wheel of the host can be installed without them."""
+    """A wheel of the host can be installed without the simulators. The demo starts them as programs."""
     forbidden_imports = []
     for project in ("host", "papers", "pi_controller", "shared"):
         for file in (ROOT / project).rglob("*.py"):
@@ -205,16 +214,17 @@ def test_no_program_of_the_instrument_imports_the_simulators():
 
 
 def test_the_simulators_in_worlds_import_nothing_of_the_instrument():
-    """They judge the instrument, so they must not share its code, and with it its assumptions."""
+    """They judge the instrument: with its code they would share its assumptions, and miss its errors."""
     files = (ROOT / "worlds").rglob("*.py")
     used = {module.split(".")[0] for file in files for _, module in list_imports(file)}
     assert used - set(sys.stdlib_module_names) == {"numpy", "scipy", "polysight_worlds"}
 
 
 def test_every_folder_of_modules_is_a_package():
-    tops = [ROOT / top / package for top, package in PROJECTS.items()]
-    folders = {f.parent for top in tops for f in top.rglob("*.py") if "build" not in f.parts}
-    assert [str(f.relative_to(ROOT)) for f in folders if not (f / "__init__.py").exists()] == []
+    folders: set[Path] = set()
+    for project, package in PROJECTS.items():
+        folders |= {file.parent for file in (ROOT / project / package).rglob("*.py")}
+    assert [str(folder.relative_to(ROOT)) for folder in folders if not (folder / "__init__.py").exists()] == []
 
 
 def test_the_pi_s_program_imports_only_the_dependencies_of_its_wheel():

@@ -6,9 +6,10 @@ process with its own arguments, environment, folder, files and signals. Other co
 ours if their environment changes how Python starts.
 
 The program is a child of the process that called `Popen`, as if that process had started it itself. For that, the
-server forks twice, the process between them ends, and the calling process adopts the orphan. So exit status, `getppid`
-and the signal at a parent's end work as usual. A program that starts others gets a server of its own, forked before the
-program begins. Workers of pytest-xdist are started in the same way, and import none of our modules again.
+server forks a middle process, the middle process forks the program and ends, and the calling process adopts the orphan.
+So the caller gets the exit status, `getppid` is the caller, and a program that asked for a signal at the end of its
+parent (PR_SET_PDEATHSIG) gets it when the caller ends. A program that starts others gets a server of its own, forked
+before the program begins. Workers of pytest-xdist are started in the same way, and import none of our modules again.
 """
 
 from __future__ import annotations
@@ -49,18 +50,29 @@ LIBRARIES = (
 )  # fmt: skip
 # Name of a worker of pytest-xdist, which execnet starts by `python -u -c CODE`
 WORKER = "worker"
-# A script that runs one of our programs: `python killed_at.py HITS OPERATIONS polysight scan ...`
+# A script that runs one of our programs and kills it at given file operations:
+# `python killed_at.py HITS OPERATIONS polysight scan ...`
 KILLED_AT = str(Path(__file__).with_name("killed_at.py"))
 # Programs that start other programs of ours, and commands of `polysight` that do
 STARTING_OTHERS = ("polysight_simulators.rig", "polysight_simulators", WORKER)
 COMMANDS_STARTING_OTHERS = frozenset({"demo", "doctor", "process", "resume", "scan", "serve"})
 # Beginnings of the names of environment variables that have an effect only when a process starts
 READ_AT_START = ("PYTHON", "LD_", "LC_", "LANG", "OMP_", "OPENBLAS_", "MPL", "MALLOC_")
-# Numbers of file descriptors below this one are free for the program. Descriptors that are passed to the program are
-# copied to numbers from this one on, until all others are closed.
+# A new program gets its files with the descriptors that Popen asks for, all below this number. Until the fork has
+# closed its other descriptors below it, it keeps these files as copies with numbers from this one on. A process may
+# usually have descriptors up to 1023 (`ulimit -n`).
 FIRST_SPARE = 700
-# Length of the server's own command line: a program's arguments are written over it, and are cut if they are longer.
+# Length of the server's own command line. A program's arguments are written over it for `ps`, which shows only this
+# many bytes of them.
 COMMAND_LINE_BYTES = 8000
+# Size of the buffer for a request, with the whole environment of the program
+REQUEST_BYTES = 1 << 20
+# Files that can be sent with a request
+MOST_FILES = 64
+# Size of the buffer for a process id in decimal digits; Linux has at most seven.
+PID_BYTES = 32
+# Default of Popen's argument `process_group`: the new process stays in the group of its parent.
+GROUP_OF_PARENT = -1
 # <linux/prctl.h>
 PR_SET_CHILD_SUBREAPER = 36
 
@@ -105,12 +117,12 @@ def may_start_others(words: list[str]) -> bool:
     return name in STARTING_OTHERS or (is_command and not COMMANDS_STARTING_OTHERS.isdisjoint(words))
 
 
-def is_ours(function: Callable[[], object] | None) -> bool:
-    """True if a function to be called in the new process can be sent to the server by its name."""
+def can_be_sent(function: Callable[[], object] | None) -> bool:
+    """True if a function to be called in the new process can be sent to the server by its name, or if there is none."""
     return function is None or function.__module__.partition(".")[0] in PACKAGES
 
 
-def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
+def select_start_variables(environment: Mapping[str, str]) -> dict[str, str]:
     """Return the environment variables that have an effect only when a process starts."""
     return {name: value for name, value in environment.items() if name.startswith(READ_AT_START)}
 
@@ -133,15 +145,15 @@ class Popen(subprocess.Popen):
         is_plain = (
             not bound_arguments["shell"]
             and bound_arguments["executable"] is None
-            and bound_arguments["process_group"] == -1
+            and bound_arguments["process_group"] == GROUP_OF_PARENT
         )
         is_our_command = bool(words) and program_name(words) != ""
-        starts_alike = read_at_start(environment) == read_at_start(os.environ)
+        starts_alike = select_start_variables(environment) == select_start_variables(os.environ)
         can_be_forked = (
             is_our_command
             and is_plain
             and starts_alike
-            and is_ours(bound_arguments["preexec_fn"])
+            and can_be_sent(bound_arguments["preexec_fn"])
             and Path(folder).is_dir()
         )
         if not can_be_forked:
@@ -186,7 +198,7 @@ class Server:
             adopt_orphans(True)
             try:
                 socket.send_fds(self._connection, [pickle.dumps(tuple(request))], files)
-                answer = self._connection.recv(32)
+                answer = self._connection.recv(PID_BYTES)
             finally:
                 adopt_orphans(False)
         if not answer:
@@ -196,7 +208,7 @@ class Server:
     def close(self) -> None:
         """End the server, if it was started."""
         if self._connection is not None:
-            # A signal to the whole process group may have ended it.
+            # A signal to the whole process group may have ended the server already.
             with suppress(OSError):
                 self._connection.shutdown(socket.SHUT_RDWR)
                 os.waitpid(self._pid, 0)
@@ -204,9 +216,10 @@ class Server:
 
 
 def install(server: Server) -> None:
-    """Let this server fork our commands in this process; it is started with the first of them.
+    """From now on let this server fork the commands of ours that this process starts.
 
-    A program that was forked has a server already, which is kept.
+    The server itself is started with the first of these commands. A program that is a fork of a server may have a
+    server already: then that one is kept.
     """
     if hasattr(subprocess.Popen, "server"):
         return
@@ -242,7 +255,8 @@ def preload() -> None:
         for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")
     ]
     with warnings.catch_warnings():
-        # As in pytest, a warning is an error; the workers would not see it, because they do not import these modules.
+        # pytest makes a warning an error. The workers are forks and import these modules no more, so that a warning
+        # at an import would never reach pytest: it is an error here.
         warnings.simplefilter("error")
         for name in (*modules, *LIBRARIES):
             if not name.endswith("__main__"):
@@ -251,41 +265,51 @@ def preload() -> None:
 
 
 def serve(connection: socket.socket) -> list[str]:
-    """Fork a program for each request. The server does not return; a program returns its arguments when it may run."""
+    """Fork a program for each request, and return its arguments in that fork when it may run.
+
+    Each process on the left forks the one on its right. The server never returns, the middle process ends at once, and
+    a new server continues this loop with a connection of its own:
+
+        server -> middle process -> program -> new server, if the program may start others
+    """
     while True:
         try:
-            message, files, _, _ = socket.recv_fds(connection, 1 << 20, 64)
+            message, files, _, _ = socket.recv_fds(connection, REQUEST_BYTES, MOST_FILES)
         except ConnectionResetError:
             # The calling process was killed before it had read the last answer.
             os._exit(0)
         if not message:
             os._exit(0)
-        # The program reports its process id to the server by these.
+        # The program reports its process id to the server by this pair of sockets.
         server_end, program_end = socket.socketpair()
         middle_pid = os.fork()
-        if middle_pid:
+        is_server = middle_pid != 0
+        if is_server:
             program_end.close()
             for file in files:
                 os.close(file)
-            answer = server_end.recv(32)
-            # When the process in the middle has ended, the calling process becomes the parent of the program.
+            answer = server_end.recv(PID_BYTES)
+            # When the middle process has ended, the calling process becomes the parent of the program.
             os.waitpid(middle_pid, 0)
             # The calling process may have been killed meanwhile: then there is no further request.
             with suppress(BrokenPipeError):
                 connection.send(answer)
             server_end.close()
             continue
-        if os.fork():
+        program_pid = os.fork()
+        is_middle_process = program_pid != 0
+        if is_middle_process:
             os._exit(0)
+        # From here on this is the program.
         request = Request(*pickle.loads(message))
         passed_files = [move_descriptor_up(file) for file in files]
         connection.close()
         server_end.close()
         if may_start_others(request.words):
-            # The program gets a server of its own, which is another fork.
             end_of_program, end_of_new_server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             new_server_pid = os.fork()
-            if not new_server_pid:
+            is_new_server = new_server_pid == 0
+            if is_new_server:
                 for file in (end_of_program.detach(), program_end.detach(), *files, *passed_files):
                     os.close(file)
                 connection = end_of_new_server
@@ -299,7 +323,7 @@ def serve(connection: socket.socket) -> list[str]:
 
 
 def move_descriptor_up(file: int) -> int:
-    """Return a copy of a descriptor that lies above the program's own."""
+    """Return a copy of a descriptor, with a number that is not used for the program's own files."""
     return fcntl.fcntl(file, fcntl.F_DUPFD_CLOEXEC, FIRST_SPARE)
 
 
@@ -312,9 +336,13 @@ def become(request: Request, files: list[int], starter: int) -> None:
     for file, number in zip(files, request.descriptors, strict=True):
         os.dup2(file, number)
         os.close(file)
-    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
-        errors = "backslashreplace" if name == "stderr" else None
-        stream = open(number, mode, 1 if name == "stderr" else -1, errors=errors, closefd=False)  # noqa: SIM115
+    # As at Python's own start: stderr is written line by line, and a character that the terminal lacks as its escape.
+    streams = {
+        "stdin": open(0, closefd=False),  # noqa: SIM115
+        "stdout": open(1, "w", closefd=False),  # noqa: SIM115
+        "stderr": open(2, "w", buffering=1, errors="backslashreplace", closefd=False),  # noqa: SIM115
+    }
+    for name, stream in streams.items():
         setattr(sys, name, stream)
         setattr(sys, f"__{name}__", stream)
     show_in_process_list(request.words)
@@ -366,10 +394,15 @@ def run(words: list[str]) -> int:
             sys.argv = words
             runpy.run_path(words[0], run_name="__main__")
     except SystemExit as e:
+        if e.code is None:
+            return 0
+        if isinstance(e.code, int):
+            return e.code
         if isinstance(e.code, str):
             sys.stderr.write(e.code + "\n")
-        return e.code if isinstance(e.code, int) else int(e.code is not None)
+        return 1
     except KeyboardInterrupt:
+        # The status that a shell reports for a program that a signal has ended
         return 128 + signal.SIGINT
     except BaseException:  # noqa: BLE001
         sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]

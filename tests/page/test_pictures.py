@@ -26,11 +26,16 @@ def decode_pixels(png: bytes) -> np.ndarray:
 
 @pytest.fixture
 def images() -> Images:
-    """Dim images (-40 dB) with one bright pixel, at the smallest y and the largest x."""
+    """Images of amplitude 0.01 (-40 dB) with one bright pixel, at the smallest y and the largest x."""
     h = np.full((NY, NX), 0.01, np.complex64)
     h[0, -1] = 1.0
-    axes = (np.arange(NX, dtype=float), np.arange(NY, dtype=float))
-    return Images(h, h.copy(), *axes, np.ones((NY, NX), bool))
+    return Images(
+        h=h,
+        v=h.copy(),
+        x_m=np.arange(NX).astype(np.float64),
+        y_m=np.arange(NY).astype(np.float64),
+        valid=np.ones((NY, NX), bool),
+    )
 
 
 def test_smallest_y_is_at_the_bottom(images):
@@ -41,21 +46,25 @@ def test_smallest_y_is_at_the_bottom(images):
     assert brightest_pixel == (NY - 1, NX - 1)
 
 
-def test_pixels_that_no_row_has_lit_are_transparent(images):
-    is_lit = np.ones((NY, NX), bool)
-    # The three rows of smallest y, which are the last ones of a picture.
-    is_lit[:3] = False
-    pictures = draw(replace(images, valid=is_lit))
+def test_invalid_pixels_are_transparent(images):
+    """A pixel is valid once a scanned row has illuminated it."""
+    valid = np.ones((NY, NX), bool)
+    # The smallest y is the first row of an image and the last row of its picture.
+    invalid_rows = 3
+    valid[:invalid_rows] = False
+    pictures = draw(replace(images, valid=valid))
     for picture in pictures.values():
         opacity = decode_pixels(picture.png)[..., 3]
-        assert (opacity[-3:] == 0).all()
+        assert (opacity[-invalid_rows:] == 0).all()
     opacity_of_amplitude = decode_pixels(pictures["h_amplitude"].png)[..., 3]
-    assert (opacity_of_amplitude[:-3] == 1).all()
+    assert (opacity_of_amplitude[:-invalid_rows] == 1).all()
 
 
-def test_pictures_of_images_with_nothing_lit_are_transparent(images):
-    nothing_lit = replace(images, valid=np.zeros((NY, NX), bool))
-    assert all((decode_pixels(p.png)[..., 3] == 0).all() for p in draw(nothing_lit).values())
+def test_pictures_without_a_valid_pixel_are_transparent(images):
+    without_valid_pixels = replace(images, valid=np.zeros((NY, NX), bool))
+    for picture in draw(without_valid_pixels).values():
+        opacity = decode_pixels(picture.png)[..., 3]
+        assert (opacity == 0).all()
 
 
 def test_the_colours_of_phases_meet_at_180_degrees(images):
@@ -88,8 +97,8 @@ def test_phases_fade_with_the_level_below_the_brightest_pixels(images, picture, 
     assert (other_opacities == 1).all()
 
 
-def test_the_picture_of_the_phase_of_p_is_that_of_the_difference_of_h_and_v(images):
-    """Phases of 1 and 0.25 rad give the same picture as 0.75 and 0 rad."""
+def test_the_picture_p_phase_shows_the_phase_of_h_minus_that_of_v(images):
+    """Phases of 1 rad in H and 0.25 rad in V give the same picture as 0.75 rad in H and 0 in V."""
     h = images.h * np.exp(1j).astype(np.complex64)
     v = images.v * np.exp(0.25j).astype(np.complex64)
     picture_of_both = draw(replace(images, h=h, v=v))["p_phase"].png
@@ -99,33 +108,47 @@ def test_the_picture_of_the_phase_of_p_is_that_of_the_difference_of_h_and_v(imag
     assert np.allclose(decode_pixels(picture_of_both), decode_pixels(picture_of_h_alone), atol=0.01)
 
 
-@pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
-def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
-    """The direct path, of amplitude 1, is at 0 m, and an echo of amplitude 0.3 at its longer path."""
-    chirp = load_published_rig().chirp
-    sweep_hz = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
-    echo_amplitude = 0.3
-    direct_and_echo = 1 + echo_amplitude * np.exp(2j * np.pi * sweep_hz * path_m / SPEED_OF_LIGHT_M_S)
-    # Four RX and five positions.
-    samples = np.tile(direct_and_echo.astype(np.complex64), (4, 5, 1))
-    zeros = np.zeros(5)
-    row = SyncedRow(
-        samples=samples,
+CHIRP = load_published_rig().chirp
+# Amplitudes relative to the direct path's, which is 1.
+ECHO_AMPLITUDE = 0.3
+# Places of the range profiles, in steps of 2 mm.
+DISTANCES_M = np.linspace(-0.2, 1.0, 601)
+
+
+def make_row(path_m: float) -> SyncedRow:
+    """A row with the direct path, and an echo whose path is longer by `path_m`."""
+    receivers = 4
+    positions = 5
+    sweep_hz = CHIRP.first_sample_hz + CHIRP.hz_per_sample * np.arange(CHIRP.samples)
+    direct_and_echo = 1 + ECHO_AMPLITUDE * np.exp(2j * np.pi * sweep_hz * path_m / SPEED_OF_LIGHT_M_S)
+    zeros = np.zeros(positions)
+    return SyncedRow(
+        samples=np.tile(direct_and_echo.astype(np.complex64), (receivers, positions, 1)),
         sweep_hz=sweep_hz,
-        valid=np.ones(5, bool),
-        chirps=np.ones(5, int),
+        valid=np.ones(positions, bool),
+        chirps=np.ones(positions, int),
         direct_hz=zeros,
         direct_amplitude=zeros,
     )
-    distances_m = np.linspace(-0.2, 1.0, 601)
-    level_db = compute_range_profile_db(row, chirp, distances_m)
-    # The limits of distances, 1 cm, are five steps of them.
-    assert abs(distances_m[level_db.argmax()]) < 0.01
+
+
+@pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
+def test_a_range_profile_has_the_direct_path_at_0_and_an_echo_at_its_longer_path(path_m):
+    level_db = compute_range_profile_db(make_row(path_m), CHIRP, DISTANCES_M)
+    # A peak may be 1 cm, five steps, away from its path.
+    tolerance_m = 0.01
+    assert abs(DISTANCES_M[level_db.argmax()]) < tolerance_m
     assert level_db.max() == pytest.approx(0.0, abs=0.05)
-    # -200 dB stand for no signal.
-    level_of_echo_db = np.where(np.abs(distances_m) < 0.2, -200.0, level_db)
-    assert distances_m[level_of_echo_db.argmax()] == pytest.approx(path_m, abs=0.01)
+    # Without the direct path the echo is the highest peak.
+    no_signal_db = -200.0
+    level_of_echo_db = np.where(np.abs(DISTANCES_M) < 0.2, no_signal_db, level_db)
+    assert DISTANCES_M[level_of_echo_db.argmax()] == pytest.approx(path_m, abs=tolerance_m)
     # Side lobes of the direct path change the level by 0.2 dB (measured).
-    assert level_of_echo_db.max() == pytest.approx(20 * np.log10(echo_amplitude), abs=0.5)
-    without_positions = replace(row, valid=np.zeros(5, bool))
-    assert np.ptp(compute_range_profile_db(without_positions, chirp, distances_m)) == 0
+    assert level_of_echo_db.max() == pytest.approx(20 * np.log10(ECHO_AMPLITUDE), abs=0.5)
+
+
+def test_the_range_profile_of_a_row_without_valid_positions_is_constant():
+    row = make_row(path_m=0.3)
+    without_positions = replace(row, valid=np.zeros_like(row.valid))
+    level_db = compute_range_profile_db(without_positions, CHIRP, DISTANCES_M)
+    assert np.unique(level_db).size == 1

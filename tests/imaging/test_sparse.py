@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polysight.imaging import ImageBuilder, fill_missing, image_grid
-from polysight.imaging.sparse import find_added_steps, reconstruct
+from polysight.imaging.sparse import find_step_divisors, reconstruct
 from polysight_shared.errors import ConfigError
 
 # Pixels (row, column) of three points, and their amplitudes
@@ -152,7 +152,7 @@ def test_a_whole_scan_does_not_change(scan):
 
 def test_steps_too_wide_for_the_image_are_divided(scan):
     coarse = scan(np.ones((20, 60), bool), step_y_mm=10.0)
-    divisor_of_y_steps = find_added_steps(coarse.rig)[0]
+    divisor_of_y_steps = find_step_divisors(coarse.rig)[0]
     assert divisor_of_y_steps > 1
     filled, _ = fill_missing(coarse)
     # 20 rows have 19 steps.

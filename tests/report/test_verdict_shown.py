@@ -33,7 +33,7 @@ from polysight.materials import TruthPlate
 from polysight.products import ProcessedScan, read_products
 from polysight.report import write_report
 from polysight.report.figures import draw_materials, draw_permittivity_map, find_phase_limits_deg
-from polysight.report.permittivity_plot import SHARES, fit_ellipse, region_matrix
+from polysight.report.permittivity_plot import SHARES, compute_ellipse, region_matrix
 from polysight.report.report import make_budget_table
 from polysight.report.style import RIGHT_IN, MapLabel, fit_labels, make_figure, shorten_labels
 from polysight.results import ErrorBudget, PermittivityFigures
@@ -182,7 +182,7 @@ def test_the_68_percent_region_has_the_given_half_widths_and_the_correlation_of_
 def test_an_ellipse_contains_its_share_of_a_normal_distribution(share, correlation):
     std = np.array([0.3, 0.05])
     matrix = np.outer(std, std) * np.array([[1, correlation], [correlation, 1]])
-    width, height, angle_deg = fit_ellipse(matrix, share)
+    width, height, angle_deg = compute_ellipse(matrix, share)
     x, y = np.random.default_rng(5).multivariate_normal([0, 0], matrix, 100_000).T
     # Coordinates along the axes of the ellipse.
     angle = np.radians(angle_deg)

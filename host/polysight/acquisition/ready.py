@@ -76,7 +76,8 @@ def measure_lost_steps(
 ) -> tuple[float, float] | None:
     """Home again after the last row; return the lost steps in x and y, millimetres.
 
-    Lost steps are the distance between the switches and where the count of steps expects them since the last homing.
+    The count of steps since the last homing gives the place at which each switch is expected; the lost steps are the
+    distance from there to the place at which it was reached.
     Returns None if the stage is not ready, or a stop was asked for. Raises ScanError if homing fails.
     """
     if stop.after_row or pi.status().state != "ready":
@@ -108,7 +109,7 @@ def _wait_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
                 "look at the stage; `journalctl -u polysight-pi -n 20` on the Pi",
                 code=ErrorCode.STAGE_NOT_READY,
             )
-        # Up to 0.1 s, or until an event comes; reading the events notes that the Pi is alive.
+        # Wait up to 0.1 s for an event of the Pi. `events` also records that the Pi is alive.
         pi.event_socket.poll(100)
         pi.events()
 
@@ -117,7 +118,8 @@ def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
     """Raise ScanError if the next row cannot begin without a person.
 
     That is so if the Pi restarted or has begun another run than `scan_id` ("" for any), after a fault, or if the stage
-    must be homed. Before the `first` row of this program, homing is allowed, and so are faults but `STAGE_FAULTS`.
+    must be homed. Before the `first` row of this program, the stage may need homing, and the Pi may report a fault that
+    is not one of `STAGE_FAULTS`.
     """
     needs_homing = status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)
     if scan_id and status.scan_id not in ("", scan_id):

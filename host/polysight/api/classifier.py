@@ -1,6 +1,7 @@
-"""Own libraries and classifiers, with scikit-learn's conventions.
+"""Train libraries and classifiers on labelled scans of your own, with scikit-learn's conventions.
 
-Columns of X are |H|, |V|, real and imaginary part of P, relative to metal, for each incidence angle. A row is a pixel.
+A row of X is a pixel. Its columns are |H|, |V|, and the real and imaginary part of P = H / V, for each incidence angle;
+H and V are the reflectivities of both channels relative to metal.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from polysight.materials import (
 if TYPE_CHECKING:
     from polysight.api.scan import Scan
 
-# Neighbours that vote, as in libraries (polysight.materials.classify.Weights).
+# Number of nearest pixels that vote on a name, the same as in library files (polysight.materials.classify.Weights).
 NEIGHBOURS = 15
 # |H|, |V|, real and imaginary part of P.
 CHANNELS = 4
@@ -81,7 +82,8 @@ class Classifier(ClassifierMixin, BaseEstimator):
     ----------
     model
         "knn": nearest neighbours as in the POLySIGHT paper, a :class:`PaperKNeighborsClassifier`. "discriminant": the
-        discriminant of error sources, which knows which errors the pixels of a patch and of a scan have in common.
+        discriminant of error sources. It takes into account that pixels of one patch, and patches of one scan, share
+        a part of their errors.
 
     Attributes
     ----------
@@ -97,8 +99,8 @@ class Classifier(ClassifierMixin, BaseEstimator):
     def fit(self, X: npt.ArrayLike, y: npt.ArrayLike, groups: npt.ArrayLike | None = None) -> Self:
         """Fit to pixels X [n, 4 * angles] of materials y [n].
 
-        `groups` [n] is the scan of each pixel: what the pixels of a scan share is not a difference of materials.
-        Without it all pixels are of one scan.
+        `groups` [n] is the scan of each pixel. An error that all pixels of a scan share, such as that of its metal
+        reference, is then not taken for a property of their materials. Without `groups` all pixels are of one scan.
 
         Raises
         ------
@@ -107,7 +109,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
             of another length.
         """
         pixels, names = _validate(self, X, y, ensure_min_samples=2)
-        # `MODEL_OF_OPTION`: name of a model in options to that in library files.
+        # Its keys are the names of models in options, its values those in library files.
         if self.model not in MODEL_OF_OPTION:
             raise ValueError(f"model is {self.model!r}: one of {', '.join(MODEL_OF_OPTION)}")
         check_classification_targets(names)
@@ -138,8 +140,10 @@ class Classifier(ClassifierMixin, BaseEstimator):
         Returns
         -------
         Score
-            `pixels` and `patches` (shares named right, mean over materials), `confusion` with `names`, `unknown`,
-            `calibration`, `not_judged` (materials of one scan).
+            `pixels` and `patches` are the shares that were named right, averaged over materials; `unknown` is the share
+            of patches that were called unknown, `calibration` the expected calibration error of the others.
+            `confusion` has its rows and columns in the order of `names`. `not_judged` are the materials that only one
+            scan contains.
 
         Raises
         ------
@@ -161,7 +165,10 @@ def _collect_samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samp
 
 
 def _to_features(X: Columns) -> Columns:
-    """Return |H|, |V|, real and imaginary part of 1 / P of pixels. Raises ValueError for other numbers of columns."""
+    """Return the features |H|, |V|, real and imaginary part of 1 / P = V / H of pixels, as the discriminant needs them.
+
+    Raises ValueError for other numbers of columns.
+    """
     if X.shape[1] % CHANNELS:
         raise ValueError(
             f"X has {X.shape[1]} feature(s): {CHANNELS} for each incidence angle, |H|, |V|, real and imaginary P"

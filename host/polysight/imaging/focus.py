@@ -25,6 +25,14 @@ from polysight.imaging.resolution import compute_limit_m
 # Largest tilt of the plane along x and along y that `focus_sweep` searches; chosen. A result near this limit is not
 # certain.
 _MAX_TILT_DEG = 3.0
+# The search describes a plane by its depth in millimetres and its slopes along x and along y in per cent, so that steps
+# of 1 suit all three. Factors to metres and to slopes:
+_FROM_SEARCH_UNITS = np.array([1e-3, 1e-2, 1e-2])
+_MM = 1e3
+_PER_CENT = 1e2
+# Axes of a point (x, y, z).
+_X_AXIS = 0
+_Y_AXIS = 1
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Focus:
     depth_mm
         Distance of the sharpest plane minus that of the rig file's plane, at the centre of the image.
     tilt_deg
-        Tilt of the sharpest plane along x and along y, degrees; positive where z grows.
+        Tilt of the sharpest plane along x and along y, degrees; positive if its z grows with x, or with y.
     gain
         Sharpness on the sharpest plane over that on the rig file's plane.
     """
@@ -87,43 +95,59 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
     builder
         Builder with all rows, and with a range gate for at least this `depth_m`.
     depth_m
-        Search range to either side of the rig file's plane.
+        Search range to either side of the rig file's plane; the default is chosen.
     planes
-        Number of planes, evenly spaced over the search range.
+        Number of planes, evenly spaced over the search range; the default, a plane each millimetre, is chosen.
     """
     grid = builder.grid
     depths = np.linspace(-depth_m, depth_m, planes)
     stack = np.zeros((planes, *grid.shape))
     for i, depth in enumerate(depths):
         for board in builder.boards.values():
-            image = board.image(replace(grid, z_m=float(np.mean(grid.z_m)) + depth))[0]
+            image, _footprint, _notice = board.image(replace(grid, z_m=float(np.mean(grid.z_m)) + depth))
             stack[i] += np.abs(image) ** 2
     cells = _compute_cell_areas(builder, depths)
     x = grid.x_m - grid.x_m.mean()
     y = grid.y_m - grid.y_m.mean()
 
     def sharpness(plane: NDArray[np.float64]) -> float:
-        """Return the sharpness on a plane [3]: depth at the centre, mm; rise along x and along y, mm per 100 mm."""
-        depth, along_x, along_y = plane * [1e-3, 1e-2, 1e-2]
-        z = np.clip(depth + along_x * x[None, :] + along_y * y[:, None], depths[0], depths[-1])
+        """Return the sharpness on a plane [3]: depth at the centre, mm; slopes along x and along y, per cent."""
+        depth, slope_x, slope_y = plane * _FROM_SEARCH_UNITS
+        z = np.clip(depth + slope_x * x[None, :] + slope_y * y[:, None], depths[0], depths[-1])
         weight = 1 / _interpolate_stack(cells, depths, z)
         intensity = _interpolate_stack(stack, depths, z)
         return float((weight * intensity**2).sum() / max(float((weight * intensity).sum()) ** 2, 1e-300))
 
-    flat = np.array([sharpness(np.array([1e3 * depth, 0.0, 0.0])) for depth in depths])
-    start = np.array([1e3 * depths[int(np.argmax(flat))], 0.0, 0.0])
-    rise = 1e2 * float(np.tan(np.radians(_MAX_TILT_DEG)))
+    # Begin at the sharpest plane without tilt.
+    flat = np.array([sharpness(np.array([_MM * depth, 0.0, 0.0])) for depth in depths])
+    start = np.array([_MM * depths[int(np.argmax(flat))], 0.0, 0.0])
+    largest_depth = _MM * depth_m
+    largest_slope = _PER_CENT * float(np.tan(np.radians(_MAX_TILT_DEG)))
+    # The simplex has the start and a neighbour at a distance of 1 along each coordinate.
+    simplex = start + np.vstack([np.zeros(3), np.eye(3)])
     optimum = scipy.optimize.minimize(
         lambda plane: -sharpness(plane) / flat.max(),
         start,
         method="Nelder-Mead",
-        bounds=[(-1e3 * depth_m, 1e3 * depth_m), (-rise, rise), (-rise, rise)],
-        options={"initial_simplex": start + np.vstack([np.zeros(3), np.eye(3)]), "xatol": 0.005, "fatol": 1e-9},
+        bounds=[
+            (-largest_depth, largest_depth),
+            (-largest_slope, largest_slope),
+            (-largest_slope, largest_slope),
+        ],
+        # The search ends when the corners of the simplex differ by less than 0.005 mm and 0.005 per cent, and their
+        # relative sharpness by less than 1e-9.
+        options={"initial_simplex": simplex, "xatol": 0.005, "fatol": 1e-9},
     )
-    depth, along_x, along_y = optimum.x
+    depth, slope_x, slope_y = optimum.x
     gain = -optimum.fun * flat.max() / sharpness(np.zeros(3))
-    tilt = np.degrees(np.arctan(np.array([along_x, along_y]) / 1e2))
-    return Focus(1e3 * depths, flat / flat.max(), float(depth), (float(tilt[0]), float(tilt[1])), float(gain))
+    tilt = np.degrees(np.arctan(np.array([slope_x, slope_y]) / _PER_CENT))
+    return Focus(
+        depths_mm=_MM * depths,
+        sharpness=flat / flat.max(),
+        depth_mm=float(depth),
+        tilt_deg=(float(tilt[0]), float(tilt[1])),
+        gain=float(gain),
+    )
 
 
 def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -131,7 +155,10 @@ def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> N
 
     It varies slowly: it is computed at nine pixels of the nearest and of the farthest plane, and interpolated between.
     """
-    aperture = next(iter(builder.boards.values())).aperture
+    # A common factor of all areas does not matter, and the cells of all boards grow with the distance in nearly the
+    # same way: those of one board are enough.
+    one_board = next(iter(builder.boards.values()))
+    aperture = one_board.aperture
     grid = builder.grid
     z = float(np.mean(grid.z_m)) + depths
     axes = (z[[0, -1]], grid.y_m[[0, grid.y_m.size // 2, -1]], grid.x_m[[0, grid.x_m.size // 2, -1]])
@@ -139,7 +166,7 @@ def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> N
     for index in np.ndindex(area.shape):
         pz, py, px = (axis[i] for axis, i in zip(axes, index, strict=True))
         point = np.array([px, py, pz])
-        area[index] = compute_limit_m(aperture, point, 0) * compute_limit_m(aperture, point, 1)
+        area[index] = compute_limit_m(aperture, point, _X_AXIS) * compute_limit_m(aperture, point, _Y_AXIS)
     interpolate = scipy.interpolate.RegularGridInterpolator(axes, area, method="linear")
     return interpolate(tuple(np.meshgrid(z, grid.y_m, grid.x_m, indexing="ij")))
 

@@ -6,8 +6,8 @@ The matched filter of a scan with few positions contains aliases. In mostly empt
     1/2 |W (G A x - y)|^2 + threshold |x|_1
 
 with the samples y, the imager's forward model A, the effect G of the range gate on an echo, and the weights W of the
-positions. `fill_missing` predicts the samples of the missing positions from x. Recorded samples are not changed, so
-that a whole scan remains the same. To estimate the error, a first fit leaves out some recorded positions, whose
+positions. `fill_missing` predicts the samples of the missing positions from x. Recorded samples are not changed: a scan
+without missing positions remains as it is. To estimate the error, a first fit leaves out some recorded positions, whose
 prediction is compared with their samples.
 """
 
@@ -35,9 +35,9 @@ value removes plates with a weak V reflection, a smaller one leaves more aliases
 """
 ITERATIONS = 40
 """Steps of the first fit of missing positions; the second fit starts from its image and takes half as many; chosen."""
-MOST_ADDED = 4
+LARGEST_DIVISOR = 4
 """Largest number of parts into which a step between positions is divided; chosen."""
-TEST_SHARE = 10
+TEST_ONE_IN = 10
 """One in this number of recorded rows, columns or positions is left out of the first fit, to test the prediction;
 chosen."""
 # The power iteration approaches the eigenvalue from below: after 12 rounds 5 % are added, so that the estimate is not
@@ -53,8 +53,8 @@ class Reconstruction:
     Attributes
     ----------
     image
-        complex64 [ny, nx]: reflectivity of each pixel with the phase of the samples, the conjugate of `Images.h`
-        and `v`. A point has its own amplitude in one pixel.
+        complex64 [ny, nx]: reflectivity of each pixel, which counts as a point scatterer of this amplitude. Its phase
+        is that of the samples, so that it is the complex conjugate of a reflectivity in `Images.h` or `Images.v`.
     residual
         float64 [iteration]: `|W (G A x - y)| / |W y|`, the unexplained share at the point that the step starts from.
     """
@@ -68,11 +68,14 @@ class _Model:
 
     def __init__(self, board: BoardSamples) -> None:
         self.imager, _ = choose_imager(board.aperture)
-        # G, [frequency, frequency].
+        # The range gate's effect G on an echo, [frequency, frequency].
         self._gate = board.model.astype(np.complex64)
 
     def samples(self, image: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
-        """Return the samples that an image predicts, as of `calibrate_samples`: [rx, frequency, row, column]."""
+        """Return the samples that an image predicts, [rx, frequency, row, column].
+
+        They compare with those of `BoardSamples.calibrate_samples`.
+        """
         echoes = self.imager.samples(image)
         return (self._gate @ echoes.reshape(*echoes.shape[:2], -1)).reshape(echoes.shape)
 
@@ -110,7 +113,7 @@ def reconstruct(
     weights = board.weights * board.used_rx[:, None, None, None]
     if selected is not None:
         weights = weights * selected
-    # W: the squared misfit has the weights W^2.
+    # The misfit |W (G A x - y)|^2 weights squared samples by W^2, which are the weights so far: W is their root.
     weights = np.sqrt(weights)
     data = board.calibrate_samples() * weights
 
@@ -121,9 +124,10 @@ def reconstruct(
         return model.adjoint(y * weights)
 
     matched = adjoint(data)
-    # Steps of 1 / lipschitz cannot overshoot. `threshold` is that of the module's formula times the length of a step.
+    # A gradient step of the length 1 / lipschitz cannot overshoot. After each step, amplitudes shrink by the threshold
+    # of the module's formula times this length.
     lipschitz = _estimate_largest_eigenvalue(lambda x: adjoint(forward(x)), matched)
-    threshold = strength * float(np.abs(matched).max()) / lipschitz
+    shrinkage = strength * float(np.abs(matched).max()) / lipschitz
     norm = float(np.linalg.norm(data)) or 1.0
     x = np.zeros_like(matched) if start is None else start
 
@@ -135,7 +139,7 @@ def reconstruct(
     for _ in range(iterations):
         misfit = forward(extrapolated) - data
         residuals.append(float(np.linalg.norm(misfit)) / norm)
-        new = _shrink_amplitudes(extrapolated - adjoint(misfit) / np.float32(lipschitz), threshold)
+        new = _shrink_amplitudes(extrapolated - adjoint(misfit) / np.float32(lipschitz), shrinkage)
         next_momentum = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
         extrapolated = (new + (momentum - 1) / next_momentum * (new - x)).astype(np.complex64)
         x = new
@@ -164,15 +168,17 @@ def _estimate_largest_eigenvalue(
     return _EIGENVALUE_MARGIN * value
 
 
-def find_added_steps(rig: Instrument) -> tuple[int, int]:
-    """Return the numbers of parts into which the steps between (rows, columns) are divided, at most `MOST_ADDED`.
+def find_step_divisors(rig: Instrument) -> tuple[int, int]:
+    """Return into how many parts to divide the steps between rows and between columns, at most `LARGEST_DIVISOR`.
 
-    With them the image has no ghosts: those of objects inside the image lie outside.
+    The image is free of ghosts with steps so short that the ghosts of an object inside the image lie outside of it.
     """
     free_mm = compute_field_limits(rig).alias_free_mm
     size_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
-    columns, rows = (int(np.ceil(size / alias_free_mm)) for size, alias_free_mm in zip(size_mm, free_mm, strict=True))
-    return min(MOST_ADDED, max(1, rows)), min(MOST_ADDED, max(1, columns))
+    parts_x, parts_y = (int(np.ceil(size / limit_mm)) for size, limit_mm in zip(size_mm, free_mm, strict=True))
+    row_divisor = min(LARGEST_DIVISOR, max(1, parts_y))
+    column_divisor = min(LARGEST_DIVISOR, max(1, parts_x))
+    return row_divisor, column_divisor
 
 
 def fill_missing(
@@ -193,18 +199,18 @@ def fill_missing(
     ConfigError
         if positions are missing and the aperture needs the direct sum: about a hundred images would take hours.
     """
-    steps = find_added_steps(builder.rig)
-    filled = ImageBuilder(_divide_steps(builder.rig, steps), builder.taper, gate_m=builder.gate_m)
+    divisors = find_step_divisors(builder.rig)
+    filled = ImageBuilder(_divide_steps(builder.rig, divisors), builder.taper, gate_m=builder.gate_m)
     errors = {}
     for name, board in filled.boards.items():
-        board.copy_samples(builder.boards[name], steps)
+        board.copy_samples(builder.boards[name], divisors)
         if board.valid.any() and not board.valid.all():
             _, direct_sum_notice = choose_imager(board.aperture)
             if direct_sum_notice is not None:
                 raise ConfigError(
                     "missing positions cannot be reconstructed on this grid of pixels",
                     direct_sum_notice,
-                    "leave --sparse out, or give pixels whose distance divides that of the positions (--grid, [image])",
+                    "leave --sparse out, or choose pixels that divide the distance of rows evenly (--grid, [image])",
                 )
             errors[name] = _fill(board, iterations)
     return filled, errors
@@ -217,14 +223,15 @@ def fill_sub_bands(sub_bands: SubBandImages) -> SubBandImages:
     return filled
 
 
-def _divide_steps(rig: Instrument, steps: tuple[int, int]) -> Instrument:
-    """Return the rig with each step between rows and between columns divided."""
+def _divide_steps(rig: Instrument, divisors: tuple[int, int]) -> Instrument:
+    """Return the rig with the steps between rows and between columns divided into that many parts."""
+    row_divisor, column_divisor = divisors
     grid = msgspec.structs.replace(
         rig.grid,
-        rows=(rig.grid.rows - 1) * steps[0] + 1,
-        columns=(rig.grid.columns - 1) * steps[1] + 1,
-        step_y_mm=rig.grid.step_y_mm / steps[0],
-        step_x_mm=rig.grid.step_x_mm / steps[1],
+        rows=(rig.grid.rows - 1) * row_divisor + 1,
+        columns=(rig.grid.columns - 1) * column_divisor + 1,
+        step_y_mm=rig.grid.step_y_mm / row_divisor,
+        step_x_mm=rig.grid.step_x_mm / column_divisor,
     )
     return msgspec.structs.replace(rig, grid=grid)
 
@@ -244,9 +251,9 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     last = reconstruct(board, max(1, iterations // 2), start=first.image)
     board.fill(model.samples(last.image))
     samples = board.calibrate_samples()
-    # Only this share of the image comes from reconstructed positions, and has their error.
-    reconstructed = _measure_image(model, samples, board.taper * ~recorded)
-    share = reconstructed / _measure_image(model, samples, board.taper)
+    # Only the part of the image that comes from reconstructed positions has their error.
+    norm_of_reconstructed_part = _measure_image(model, samples, board.taper * ~recorded)
+    share = norm_of_reconstructed_part / _measure_image(model, samples, board.taper)
     return ReconstructedPositions(
         missing_share=float(1 - recorded.mean()),
         residual=float(last.residual[-1]),
@@ -261,11 +268,11 @@ def _choose_test_positions(recorded: Mask) -> Mask:
     columns = np.flatnonzero(recorded.any(axis=0))
     tested = np.zeros_like(recorded)
     if rows.size < recorded.shape[0]:
-        tested[rows[TEST_SHARE // 2 :: TEST_SHARE]] = True
+        tested[rows[TEST_ONE_IN // 2 :: TEST_ONE_IN]] = True
     elif columns.size < recorded.shape[1]:
-        tested[:, columns[TEST_SHARE // 2 :: TEST_SHARE]] = True
+        tested[:, columns[TEST_ONE_IN // 2 :: TEST_ONE_IN]] = True
     else:
-        tested = np.random.default_rng(0).uniform(size=recorded.shape) < 1 / TEST_SHARE
+        tested = np.random.default_rng(0).uniform(size=recorded.shape) < 1 / TEST_ONE_IN
     return tested & recorded
 
 

@@ -3,8 +3,9 @@
 New products are written into a folder next to the old one, and replace it when complete. If the program is killed at
 any time, the folder holds either the old or the new products.
 
-Boxes drawn by hand are kept in `labels.json` of the scan folder. The `labels.json` among products is the classifier's
-unless it contains `by_hand`; such a file is kept when products of the same scan are replaced.
+Boxes drawn by hand are kept in `labels.json` of the scan folder. A `labels.json` among products comes from the
+classifier; but if it contains `by_hand`, its boxes were drawn by hand, and it is kept when products of the same scan
+are replaced.
 """
 
 from __future__ import annotations
@@ -60,21 +61,22 @@ class FolderLock:
     BlockingIOError
         if another program has locked it.
     OSError
-        if it cannot be created or opened; also for a link, through which nothing is written.
+        if it cannot be created or opened, or if it is a symbolic link.
     """
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(exist_ok=True)
-        self._beside: Path | None = None
+        self._lock_path: Path | None = None
         if hasattr(os, "O_DIRECTORY"):
             self._descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         else:
-            self._beside = folder.with_name(f"{folder.name}.lock")
-            self._descriptor = os.open(self._beside, os.O_RDWR | os.O_CREAT)
+            self._lock_path = folder.with_name(f"{folder.name}.lock")
+            self._descriptor = os.open(self._lock_path, os.O_RDWR | os.O_CREAT)
         try:
             lock_file(self._descriptor)
-            # Between opening and locking, the program that held the lock may have moved the folder into its place.
-            if self._beside is None and not os.path.samestat(os.fstat(self._descriptor), folder.stat()):
+            # Between opening and locking, the program that held the lock may have renamed the folder that was opened
+            # here, to replace other products with it. Then `folder` is the name of another folder now.
+            if self._lock_path is None and not os.path.samestat(os.fstat(self._descriptor), folder.stat()):
                 raise BlockingIOError("it has just replaced another folder")
         except BaseException:
             self.close()
@@ -83,10 +85,10 @@ class FolderLock:
     def close(self) -> None:
         """Unlock."""
         os.close(self._descriptor)
-        if self._beside is not None:
-            # Another program may hold it now.
+        if self._lock_path is not None:
+            # Windows does not delete a file that another program has opened since.
             with suppress(OSError):
-                self._beside.unlink()
+                self._lock_path.unlink()
 
 
 def check_products_folder(out: Path, scan_id: str) -> None:
@@ -310,7 +312,7 @@ def find_scan_folder(folder: Path) -> Path | None:
     parent = folder.resolve().parent
     if not is_source(parent):
         return None
-    # The path is kept as the user wrote it, except where its parent is no other folder: that of `.` is `.`.
+    # Return the path as the user wrote it, if it names the parent: `Path(".").parent` is the folder itself.
     if folder.parent.resolve() == parent:
         return folder.parent
     return parent
@@ -339,7 +341,10 @@ def find_labels(folder: Path) -> tuple[Path, Labels] | None:
 
 
 def _read_hand_labels(products: Path, scan_id: str) -> dict[str, bytes]:
-    """Return the label file by hand among products of this scan and its picture, name to content."""
+    """Return the label file drawn by hand and its picture from products of this scan: file name to content.
+
+    The result is empty if the products are of another scan or have no such file.
+    """
     path = products / LABELS
     try:
         if not path.exists() or ProcessedScan(products).scan_id != scan_id or not _is_by_hand(path):

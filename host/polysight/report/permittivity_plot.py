@@ -32,14 +32,25 @@ from polysight.report.style import (
 )
 from polysight.results import PatchFigures, PermittivityFigures
 
-SHARES = {0.68: 2.279, 0.95: 5.991}
-"""Share that an ellipse holds to its squared Mahalanobis radius: quantiles of chi-squared, two degrees of freedom."""
+_INNER_SHARE = 0.68
+_OUTER_SHARE = 0.95
+SHARES = {_INNER_SHARE: 2.279, _OUTER_SHARE: 5.991}
+"""Keys: the share of a normal distribution inside an ellipse. Values: the squared Mahalanobis radius of this ellipse,
+a quantile of chi-squared with two degrees of freedom.
+"""
 _STYLES: dict[float, dict[str, Any]] = {
-    0.68: {"linestyle": "-", "linewidth": 1.2},
-    0.95: {"linestyle": "--", "linewidth": 0.8},
+    _INNER_SHARE: {"linestyle": "-", "linewidth": 1.2},
+    _OUTER_SHARE: {"linestyle": "--", "linewidth": 0.8},
 }
-# Room for a patch's number (width, height) and for its point in `draw_permittivity_figure`, in points of 1/72 inch;
-# chosen. A digit is 6 wide and 8 high, so that numbers of two digits may touch; a point with its edge is 6.6.
+# Sizes in inches; chosen. The figure is higher if its legend needs it, which has a line for each patch, some more lines
+# and a margin.
+_WIDTH_IN = 7.8
+_SMALLEST_HEIGHT_IN = 4.4
+_LEGEND_LINE_IN = 0.19
+_OTHER_LEGEND_IN = 1.5
+# Sizes of a patch's number (width, height) and of a point that `place_numbers` assumes, in points of 1/72 inch; chosen.
+# A number of two digits is drawn 12 wide and 8 high, a point 6.6 wide with its edge: where there is little room, they
+# may touch.
 _LABEL_PT = (9.0, 9.0)
 _POINT_PT = 5.0
 # Places that `place_numbers` tries: rings around the point, and directions on each; chosen.
@@ -57,7 +68,7 @@ Point = tuple[float, float]
 Estimate = tuple[PatchFigures, PermittivityFigures]
 
 
-def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
+def compute_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
     """Return width, height and angle in degrees of the ellipse that holds a share (a key of `SHARES`).
 
     `matrix` is the covariance [2, 2] of a normal distribution.
@@ -68,16 +79,19 @@ def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
 
 
 def region_matrix(estimate: PermittivityFigures, share: float) -> Array | None:
-    """Return the covariance [2, 2] of (eps', eps'') whose :func:`fit_ellipse` holds a share; None if no error is known.
+    """Return the covariance [2, 2] of (eps', eps'') whose :func:`compute_ellipse` holds a share.
 
-    The standard errors are such that their ellipse of 95 % holds 95 %. Errors have long tails, so that 68 % lie closer
-    than in a normal distribution: `half_widths_68` says how close.
+    None if no error is known.
+
+    The covariance of an estimate is scaled so that its 95 % ellipse holds the truth in 95 % of all cases. Errors have
+    longer tails than a normal distribution, so that its 68 % ellipse would be too large: there the half widths of the
+    68 % intervals, `half_widths_68`, take the place of the standard deviations.
     """
     if estimate.spread is None:
         return None
     matrix = estimate.spread.matrix
-    if share == min(SHARES) and estimate.half_widths_68 is not None:
-        # Both axes shrink to the half widths that were found: C_ij becomes s_i C_ij s_j.
+    if share == _INNER_SHARE and estimate.half_widths_68 is not None:
+        # With s_i = half width / standard deviation, C_ij becomes s_i C_ij s_j.
         shrinkage = np.array(estimate.half_widths_68) / np.sqrt(np.diag(matrix))
         matrix = matrix * np.outer(shrinkage, shrinkage)
     return matrix
@@ -102,12 +116,15 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
     angles_rad = np.radians(45 + np.arange(_ANGLES) * 360 / _ANGLES)
     ring = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=1)
     candidates = np.concatenate([radius * ring for radius in _RADII_PT])
+    # A label covers a point if it is closer than this in x and in y.
+    smallest_offset = np.array(_LABEL_PT) / 2 + _POINT_PT / 2
     for point in points:
         best = point + candidates[0]
         least_cost = math.inf
         for place in point + candidates:
             labels_covered = sum(bool((np.abs(place - taken_place) < _LABEL_PT).all()) for taken_place in taken_places)
-            points_covered = (np.abs(keep_clear - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
+            is_covered = (np.abs(keep_clear - place) < smallest_offset).all(axis=1)
+            points_covered = is_covered.sum()
             # A number on another one cannot be read; one on a point can.
             cost = 2.0 * labels_covered + points_covered
             if cost < least_cost:
@@ -128,15 +145,14 @@ def draw_permittivity_figure(scan: ProcessedScan) -> bytes | None:
     if not estimates:
         return None
     colours = assign_colours(scan)
-    # Inches; the legend needs a line for each patch.
-    size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
-    fig = make_figure(*size_in, RIGHT_IN)
+    legend_in = _OTHER_LEGEND_IN + _LEGEND_LINE_IN * len(estimates)
+    fig = make_figure(_WIDTH_IN, max(_SMALLEST_HEIGHT_IN, legend_in), RIGHT_IN)
     ax = fig.add_subplot()
     truths = [t for patch, _ in estimates if (t := _find_truth(patch))]
     title = "Permittivity"
     if truths:
         title += ", estimate and truth"
-    style_axes(ax, title, scan.stamped)
+    style_axes(ax, title, simulated=scan.stamped)
     ax.set_aspect("auto")
     ax.set_facecolor("white")
     ax.grid(color="#e6e9ee", linewidth=0.8)
@@ -173,12 +189,12 @@ def _draw_estimate(ax: Axes, estimate: PermittivityFigures, truth: Point | None,
     if regions:
         for share, matrix in regions.items():
             style = _STYLES[share]
-            width, height, angle = fit_ellipse(matrix, share)
+            width, height, angle = compute_ellipse(matrix, share)
             outline = Ellipse(
                 centre, width, height, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style
             )
             ax.add_patch(outline)
-            if share == min(_STYLES):
+            if share == _INNER_SHARE:
                 # Only the inner region is filled.
                 area = Ellipse(centre, width, height, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2)
                 ax.add_patch(area)
@@ -218,10 +234,14 @@ def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequ
 def _measure_half_size(estimate: PermittivityFigures) -> Point:
     """Return how far the drawing of an estimate reaches in (real part, loss): its 95 % ellipse, or its bars."""
     if estimate.spread is not None:
-        radius = math.sqrt(SHARES[0.95])
+        radius = math.sqrt(SHARES[_OUTER_SHARE])
         return radius * estimate.spread.real_std, radius * estimate.spread.loss_std
-    real = max(abs(end - estimate.real) for end in estimate.real_p30_p70 or (estimate.real,))
-    return real, max(abs(end - estimate.imag) for end in estimate.imag_p30_p70 or (estimate.imag,))
+    # Without percentiles there are no bars, and the half size is 0.
+    real_ends = estimate.real_p30_p70 or (estimate.real,)
+    imag_ends = estimate.imag_p30_p70 or (estimate.imag,)
+    real_half_size = max(abs(end - estimate.real) for end in real_ends)
+    imag_half_size = max(abs(end - estimate.imag) for end in imag_ends)
+    return real_half_size, imag_half_size
 
 
 def _draw_legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
@@ -251,10 +271,10 @@ def _draw_legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, 
 
 def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths: Sequence[Point]) -> None:
     """Write the patches' numbers beside their points, with a line to numbers that are further away."""
-    per_point = fig.dpi / 72
+    pixels_per_point = fig.dpi / 72
     values = np.array([(estimate.real, estimate.loss) for _, estimate in estimates])
-    points = ax.transData.transform(values) / per_point
-    crosses = ax.transData.transform(np.array(truths, float).reshape(-1, 2)) / per_point
+    points = ax.transData.transform(values) / pixels_per_point
+    crosses = ax.transData.transform(np.array(truths, float).reshape(-1, 2)) / pixels_per_point
     places = place_numbers(points, crosses)
     leader_line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
     for (patch, estimate), place, point in zip(estimates, places, points, strict=True):

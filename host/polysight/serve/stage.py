@@ -1,7 +1,8 @@
-"""Home and jog of the stage from the page: the Pi decides if it may move, and stops a jog whose server has ended.
+"""Home and jog of the stage from the web page: the Pi decides if the stage may move.
 
-It works in the server's process, each request in a thread of its own, so that no page that reads scans delays a stop.
-While a scan runs, the Pi refuses these commands.
+The commands run in the web server's process, each in a thread of its own, and therefore a request to stop never waits
+for requests that read scans. If the web server ends during a jog, the Pi stops the stage. While a scan runs, the Pi
+refuses these commands.
 """
 
 from __future__ import annotations
@@ -46,24 +47,26 @@ class StagePlace(msgspec.Struct, frozen=True):
 
 
 class StageControl:
-    """The stage of a rig file, for the page; all clients of one server share an owner, so that each can stop a jog."""
+    """The stage of a rig file, for the page."""
 
     def __init__(self, config: Path) -> None:
         self._config = config
+        # The Pi knows by this text whose jog it is, and lets only this client stop it. All browsers of one server share
+        # the text, so that each can stop the jog of another.
         self._owner = secrets.token_hex(16)
         self._jogging = threading.Lock()
 
     def read_position(self) -> StagePlace:
         """Return the position of the stage. Raises PolysightError, as the other commands do."""
-        return self._ask(lambda _pi, _rig: None)
+        return self._run_on_pi(lambda _pi, _rig: None)
 
     def home(self) -> StagePlace:
         """Start homing."""
-        return self._ask(lambda pi, _: pi.home())
+        return self._run_on_pi(lambda pi, _: pi.home())
 
     def stop(self) -> StagePlace:
         """Stop homing or a jog."""
-        return self._ask(lambda pi, _: pi.abort("stopped on the page"))
+        return self._run_on_pi(lambda pi, _: pi.abort("stopped on the page"))
 
     def jog(self, request: JogRequest) -> StagePlace:
         """Move, and wait for the end. Refused while another jog of this server moves."""
@@ -75,11 +78,11 @@ class StageControl:
                 code=ErrorCode.BUSY,
             )
         try:
-            return self._ask(lambda pi, rig: pi.jog(request.axis, request.distance_mm, rig.stage.speed_mm_s))
+            return self._run_on_pi(lambda pi, rig: pi.jog(request.axis, request.distance_mm, rig.stage.speed_mm_s))
         finally:
             self._jogging.release()
 
-    def _ask(self, work: Callable[[PiClient, Instrument], object]) -> StagePlace:
+    def _run_on_pi(self, work: Callable[[PiClient, Instrument], object]) -> StagePlace:
         """Execute `work` with a connection to the Pi, and return the position of the stage after it."""
         rig = load_instrument(self._config)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

@@ -22,12 +22,12 @@ REQUEST_FOOTER = 0xEEAA
 SOURCE_PORT = 1024
 # Header of a data packet: u32 sequence number, u48 byte count.
 DATA_HEADER_BYTES = 10
-# "packet size 1470" carries 1456 bytes of payload.
+# The size of a packet that command 0x0B sets is larger than the packet's payload: 1470 gives 1456 bytes (seen).
 PACKET_OVERHEAD_BYTES = 14
 # Time from the last LVDS data to the short last packet, as seen on a card.
 TAIL_S = 2.0
-# Version 2.8: bytes 02 04 (seen).
-FPGA_VERSION = 2 | 8 << 7
+# Version 2.8 (seen): the major number is in bits 0 to 6, the minor one in bits 7 to 13.
+FPGA_VERSION = 2 + (8 << 7)
 # Unit in which the card counts the delay between packets (command 0x0B).
 DELAY_TICK_S = 8e-9
 # Timeout after record start without data, until command 0x03 sets another.
@@ -35,10 +35,11 @@ TIMER_S = 30
 # Smallest (inferred) and largest size of a packet, as command 0x0B counts it.
 _MIN_PACKET = 48
 _MAX_PACKET = 1470
-# Number of choices of each byte of command 0x03 but the last, counted from 1.
-_CHOICES = (2, 2, 2, 2, 3)
-# Choice of byte 1 of command 0x03: four LVDS lanes.
-_FOUR_LANES = 1
+# Bytes of command 0x03: five settings, whose smallest value is 1, and the timer in seconds.
+_LARGEST_SETTINGS = (2, 2, 2, 2, 3)
+# The settings that suit the radar: raw mode, four LVDS lanes, capture, Ethernet, 16 bits. A card that is set up for two
+# lanes records nothing.
+_SETTINGS_OF_RADAR = (1, 1, 1, 2, 3)
 
 Bytes2D = NDArray[np.uint8]
 
@@ -77,12 +78,15 @@ class Network(NamedTuple):
 
     @staticmethod
     def decode(body: bytes) -> Network:
-        """Parse the 18 bytes of command 0x04, addresses from their last byte. Raises ProtocolError for other sizes."""
+        """Parse the 18 bytes of command 0x04, with the last byte of each address first.
+
+        Raises ProtocolError for other sizes.
+        """
         if len(body) != 18:
             raise ProtocolError(f"EEPROM body of {len(body)} bytes, expected 18")
-        host = body[3::-1]
-        card = body[7:3:-1]
-        mac = body[13:7:-1]
+        host = body[0:4][::-1]
+        card = body[4:8][::-1]
+        mac = body[8:14][::-1]
         command_port, data_port = struct.unpack("<HH", body[14:])
         return Network(".".join(map(str, host)), ".".join(map(str, card)), mac, command_port, data_port)
 
@@ -261,23 +265,25 @@ class Card:
     def _configure(self, code: int, body: bytes, well_formed: bool) -> int:
         """Execute a request other than record start and stop; return the status of its reply.
 
-        That is 0: done, 1: refused, or the version that was asked for.
+        The status is 0 for done and 1 for refused, or it is the version that was asked for.
         """
         if code == Code.RESET_FPGA:
             self.reset_fpga()
         elif code == Code.CONFIGURE_FPGA:
             # The card also answers bodies of wrong length or content (seen).
-            if well_formed and len(body) == 6 and all(1 <= b <= n for b, n in zip(body, _CHOICES, strict=False)):
-                # The radar sends on four LVDS lanes: a card set up for two records nothing.
-                # The others: raw, capture, ethernet, 16 bit.
-                self._suits_radar = tuple(body[:5]) == (1, _FOUR_LANES, 1, 2, 3)
-                self._timer_s = body[5]
+            if well_formed and len(body) == 6:
+                settings = tuple(body[:5])
+                timer_s = body[5]
+                if all(1 <= setting <= n for setting, n in zip(settings, _LARGEST_SETTINGS, strict=True)):
+                    self._suits_radar = settings == _SETTINGS_OF_RADAR
+                    self._timer_s = timer_s
         elif code == Code.CONFIGURE_PACKET:
             if well_formed and len(body) == 6:
                 size, ticks, _ = struct.unpack("<HHH", body)
                 if size < _MIN_PACKET:
                     return 1
-                # mmWave Studio and most clients request 1472, get "done", and 1456 as with 1470 (read).
+                # mmWave Studio and most clients set 1472: the card replies "done" and sends 1456 bytes, the payload of
+                # 1470 (read).
                 self._packetiser.payload_bytes = min(size, _MAX_PACKET) - PACKET_OVERHEAD_BYTES
                 self.packet_delay_s = ticks * DELAY_TICK_S
         elif code == Code.EEPROM:
@@ -317,4 +323,8 @@ class Card:
         """End the record; return the short last packet, if any, and the status."""
         self._recording = False
         tail = self._packetiser.flush()
-        return [*([Packets(tail)] if len(tail) else []), make_message(Code.STATUS, status)]
+        output: list[Output] = []
+        if len(tail):
+            output.append(Packets(tail))
+        output.append(make_message(Code.STATUS, status))
+        return output

@@ -9,7 +9,7 @@ from polysight.imaging import ImagedWith, Images, image_grid
 from polysight.polarimetry import Leakage, PlaneReference, plane_reference
 from polysight_shared.config import Instrument
 
-SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
+SOURCES = [SourceScan("plate", "scans/plate", simulated=True, rows=7)]
 
 
 def make_board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardFilter:

@@ -45,8 +45,8 @@ class Material:
 class Errors:
     """Errors of drawn pixels: standard deviations of the relative amplitude and of the phase, and the leakage.
 
-    Half of a variance is that of an error which all pixels of a box share. `leakage` is the amplitude of r_p in H and
-    of r_s in V.
+    An error is the sum of two parts with half of the variance each: one that all pixels of a box share, and one that
+    is drawn for each pixel. `leakage` is the amplitude of r_p in H and of r_s in V.
     """
 
     amplitude: float = 0.009
@@ -146,8 +146,9 @@ def write_labels(
     path = folder / scan
     path.mkdir(parents=True)
     shape = (IMAGE_PIXELS, IMAGE_PIXELS)
-    images = [BACKGROUND * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) for _ in "hv"]
-    gains = [draw_gain(rng) for _ in "hv"]
+    # H and V
+    images = [BACKGROUND * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) for _ in range(2)]
+    gains = [draw_gain(rng) for _ in range(2)]
     # A phase that both channels share, of one turn in 900 pixels along each axis: the scene is tilted by a tenth of a
     # degree.
     turns = np.arange(IMAGE_PIXELS) / 900.0

@@ -21,6 +21,7 @@ from polysight_simulators.scene import decode_scene
 from polysight_simulators.scene.simulated_scan import truth
 from tests.support.pipelines import make_pipeline
 
+# Name of each dielectric plate to its centre in millimetres and its permittivity eps', eps''
 PLATES = {
     "ceramic": ([-62.0, 32.0], [4.75, 2.43]), "acrylic": ([0.0, 34.0], [4.0, 0.4]), "PET": ([62.0, 32.0], [3.78, 0.7]),
     "wood": ([-62.0, -32.0], [2.61, 0.01]), "rubber": ([62.0, -32.0], [5.06, 1.11]),

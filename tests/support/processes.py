@@ -15,9 +15,9 @@ import pytest
 from polysight.cli.main import main
 from tests.support.paths import BIN
 
-# A test that waits for something fails when the processor has been idle for so many seconds (see `read_idle_s`).
+# A test that waits for something fails when the processor has been idle for this many seconds (see `read_idle_s`).
 LIMIT_S = 60.0
-# A call that blocks (socket, queue, thread) counts as hanging after so many seconds by the clock, also on a busy
+# A call that blocks (socket, queue, thread) counts as hanging after this many seconds by the clock, also on a busy
 # machine.
 HANG_S = 900.0
 
@@ -81,7 +81,7 @@ def read_output(*arguments: object) -> str:
 
 
 class Program:
-    """A command in a process group of its own, its output in files."""
+    """A command that runs in a process group of its own, and whose output goes to files."""
 
     def __init__(self, command: Sequence[str | Path], folder: Path, cwd: Path, env: dict[str, str] | None) -> None:
         self._out = folder / f"out-{time.monotonic_ns()}"

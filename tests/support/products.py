@@ -102,7 +102,7 @@ def write_judged_products(folder: Path, level: str | None, keep_withheld: bool =
 
 
 def name_check_plate(products: Path, plate: CheckPlate) -> None:
-    """Make saved products those of a rig whose file has this check plate."""
+    """Change saved products as if the file of their rig had named this check plate."""
     facts = read_products(products).facts
     rig = {**facts.instrument, "check": msgspec.to_builtins(plate)}
     write_json(products / SCAN, msgspec.structs.replace(facts, instrument=rig))
@@ -130,11 +130,15 @@ def _encode_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-# A PNG of one pixel.
+# The header of a PNG of one grey pixel: width, height and bits of a pixel; colour type, compression, filter and
+# interlace are 0.
+_PNG_HEADER = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)
+# The filter of the only line, and its only pixel
+_PNG_LINE = b"\0\0"
 PIXEL = (
     b"\x89PNG\r\n\x1a\n"
-    + _encode_chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
-    + _encode_chunk(b"IDAT", zlib.compress(b"\0\0"))
+    + _encode_chunk(b"IHDR", _PNG_HEADER)
+    + _encode_chunk(b"IDAT", zlib.compress(_PNG_LINE))
     + _encode_chunk(b"IEND", b"")
 )
 

@@ -6,6 +6,7 @@ import tomli_w
 
 COPPER = {"name": "copper", "centre_mm": [-40.0, 10.0], "size_mm": [50.0, 50.0], "metal": True}
 PET = {"name": "PET", "centre_mm": [36.0, 6.0], "size_mm": [50.0, 50.0], "permittivity": [3.78, 0.7]}
+# A copper plate that covers the whole image
 EVERYWHERE = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [500.0, 400.0], "metal": True}
 
 

@@ -14,7 +14,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.processes import Bench, Program, wait_for
 from tests.support.scenes import write_small_scene
 
-SCENE = write_small_scene(12, 6, pulses=4, pixels=40, pixel_mm=4.0)
+SCENE = write_small_scene(columns=12, rows=6, pulses=4, pixels=40, pixel_mm=4.0)
 
 
 class Rig(Bench):
@@ -34,19 +34,12 @@ class Rig(Bench):
         """Start the simulators and the Pi."""
         folder = self.folder
         (folder / "scene.toml").write_text(self._scene)
-        options = (
-            "--config",
-            RIG_FILE,
-            "--scene",
-            folder / "scene.toml",
-            "--dir",
-            folder / "rig",
-            "--time-scale",
-            str(self._time_scale),
-        )
+        options: list[str | Path] = ["--config", RIG_FILE, "--scene", folder / "scene.toml"]
+        options += ["--dir", folder / "rig", "--time-scale", str(self._time_scale)]
         self.simulators = self.start("python", "-m", "polysight_simulators.rig", *options, env=self._env)
-        base = Path(self.simulators.wait_ready())
-        table = to_builtins(load_instrument(base))
+        # When they are ready the simulators print the path of a rig file with their addresses.
+        simulated_rig_file = Path(self.simulators.wait_ready())
+        table = to_builtins(load_instrument(simulated_rig_file))
         # These limits are short, so that tests that end a program do not wait long for the error.
         table["limits"] |= {"command_timeout_s": 1.5, "end_of_record_s": 1.0}
         table["pi"]["heartbeat_ms"] = 100

@@ -38,6 +38,7 @@ def test_help_has_an_example_with_valid_options(parser):
     text = parser.format_help()
     _, heading, examples = text.partition("example")
     assert heading, f"`{parser.prog} --help` shows no example"
+    # An example follows `example:` on the same line, or is an indented line after `examples:`.
     lines = re.findall(r"^(?:s?: *|  +)((?:polysight|python -m)\S*(?: .*)?)$", examples, re.MULTILINE)
     # A remark may follow an example, after a comma or three spaces.
     lines = [re.split(r", |   ", line)[0].strip() for line in lines]

@@ -102,7 +102,7 @@ def test_the_example_of_a_label_file_is_valid(tmp_path):
 
 
 def test_the_python_code_on_the_page_about_imaging_runs(tmp_path, monkeypatch):
-    """It uses packages that are not part of the public interface, so that their names may change without notice."""
+    """The code uses packages that are not part of the public interface: their names may change without notice."""
     scene = decode_scene(make_scene(COPPER, columns=4, rows=3), "test")
     simulate(load_published_rig(), scene, tmp_path / "scans" / "points")
     monkeypatch.chdir(tmp_path)

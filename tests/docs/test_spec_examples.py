@@ -178,7 +178,7 @@ def test_the_stage_line_example_numbers_its_commands_and_answers_each_of_them():
 
 
 def test_the_code_encodes_the_requests_to_a_card_that_the_page_shows():
-    packet_configuration = dca1000.encode_packet_configuration(1470, 25.0)
+    packet_configuration = dca1000.encode_packet_configuration(packet_bytes=1470, delay_us=25.0)
     requests = {
         ("record start", "request"): (dca1000.Code.RECORD_START, b""),
         ("configure FPGA", "request"): (dca1000.Code.CONFIGURE_FPGA, dca1000.encode_fpga_configuration()),
@@ -239,7 +239,7 @@ def test_the_page_shows_the_messages_that_configure_a_radar_of_the_published_rig
         DEVICE_CONFIGURATION,
         *board_program.basic,
         *board_program.waveform,
-        *board_program.make_frame_commands(rig.grid.columns * 16),
+        *board_program.make_frame_commands(rig.grid.columns * rig.burst.pulses),
     ]
     # Columns of the table: number, name, fields, content for the published rig.
     contents = {number: content for number, _, _, content in read_table_rows("mmwavelink.md", "Sub-blocks")}
@@ -285,8 +285,8 @@ def test_the_page_has_the_number_and_name_of_every_event_of_a_radar_and_says_whe
     name_by_number = {int(number, 16): name for number, name, _, _ in rows}
     assert name_by_number == {number: name for number, (name, _) in radar_messages._EVENTS.items()}
     for number, _, _, fatal in rows:
-        # The first byte is the type of a fault; those of type 255 are never fatal. Events without a type have groups of
-        # 32 bits, some of which are set here, too.
+        # The first byte of a fault is its type; faults of type 255 are never fatal. The data of other events are groups
+        # of 32 bits, and the same bytes set some of these bits.
         data_of_each_type = [bytes([event_type, 0, 0, 0] * 6) for event_type in range(255)]
         events = [decode_event(SubBlock(int(number, 16), data)) for data in data_of_each_type]
         assert any(event.fatal for event in events) == (fatal != "no"), number

@@ -51,7 +51,11 @@ def nodes() -> list[ast.AST]:
 
 def find_name(expression: ast.expr) -> str:
     """Last name of an expression such as `zip` or `np.load`; "" for any other expression."""
-    return expression.attr if isinstance(expression, ast.Attribute) else getattr(expression, "id", "")
+    if isinstance(expression, ast.Attribute):
+        return expression.attr
+    if isinstance(expression, ast.Name):
+        return expression.id
+    return ""
 
 
 def find_flag(keywords: list[ast.keyword], name: str) -> object:

@@ -62,7 +62,7 @@ def test_every_command_and_entry_point_of_a_project_names_a_function(folder):
 
 
 def test_an_editable_installation_is_a_path_file():
-    """Not an import hook, because type checkers and editors run no hooks, and would not find the packages."""
+    """Type checkers and editors read path files, but run no import hooks: with a hook they would find no package."""
     for folder in PROJECTS:
         name = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"]
         try:

@@ -17,9 +17,10 @@ ROOT = Path(__file__).parents[2]
 STOP_PATTERN = re.compile(r"^\| (\d+) \| [^|]+ \| `([^`]+)` \| `([^`]+)` \|$")
 # More stops would be no overview.
 MAX_STOPS = 12
-# The first stop in the processing of a recorded scan. Earlier ones run while the scan is recorded; tests/e2e does that.
+# The first stop in the processing of a recorded scan. Earlier stops are called only while a scan is recorded, and not
+# by the tests of this file.
 FIRST_STOP_OF_PROCESSING = 6
-# A reader who follows one row from its raw bytes to a material's name must open at most so many files.
+# A reader who follows one row from its raw bytes to a material's name must open at most this many files.
 MAX_FILES_OF_A_ROW = 30
 # Methods of Pipeline that process a row, in their order.
 STEPS_OF_A_ROW = ("add_row", "form_images", "place_plane", "find_materials")

@@ -108,7 +108,8 @@ def test_a_rig_without_calibration_files_is_not_changed(make_rig):
     rig = make_rig()
     calibration = load_rig_calibration(rig)
     assert calibration.rig(rig) is rig
-    assert calibration.high_pass("RH") is calibration.reference() is None
+    assert calibration.high_pass("RH") is None
+    assert calibration.reference() is None
     assert calibration.files() == {}
 
 
@@ -191,7 +192,7 @@ def test_images_of_another_metal_reference_are_refused(tmp_path, make_rig):
 def test_simulated_calibration_is_refused_for_a_measured_scan(tmp_path, rig_naming, hpf):
     with expect_refusal(ErrorCode.MISMATCH, hpf):
         copy_into_scan(rig_naming(hpf=hpf), tmp_path / "scan", simulated=False)
-    measured_sweep = SourceScan("sweep", "scans/sweep", False, 7)
+    measured_sweep = SourceScan("sweep", "scans/sweep", simulated=False, rows=7)
     measured = msgspec.structs.replace(make_filter_file(), sources=[measured_sweep])
     rig = rig_naming(hpf=write_calibration(measured, hpf.parent))
     assert set(copy_into_scan(rig, tmp_path / "scan", simulated=False)) == {"hpf"}

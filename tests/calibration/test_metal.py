@@ -16,7 +16,7 @@ from polysight.materials import KnownScene
 from polysight.pipeline import Pipeline
 from polysight.settings import Settings
 from polysight.store import ScanFolder
-from polysight_shared.errors import ErrorCode
+from polysight_shared.errors import DataError, ErrorCode
 
 
 def set_board_values(name, **values):
@@ -56,8 +56,8 @@ def set_table_values(**tables):
 
 V_MOVED = add_mount_steps("RV", last=[{"shift_mm": [0.0, 0.05, 0.0]}])
 
-# Changes after which a metal reference does not hold, because phases or amplitudes of images change; and the
-# words that the message must have.
+# Changes after which a metal reference is not valid, because phases or amplitudes of images change; and the words that
+# the message must have.
 CHANGES_THAT_MATTER = {
     "V moved": (V_MOVED, ["RV"]),
     "H turned about the line of its antennas": (add_mount_steps("RH", first=[{"turn_deg": 1.0, "about": "x"}]), ["RH"]),
@@ -173,7 +173,8 @@ def test_a_scan_without_metal_is_refused(tmp_path, make_rig, make_scan):
     small = {"grid": {"columns": 4, "rows": 3}, "image": {"columns": 20, "rows": 20}}
     point = {"position_mm": [0.0, 0.0], "amplitude": [1e-3, 0.0]}
     folder = make_scan(tmp_path / "air", make_rig(**small), points=[point])
-    assert main(["calibrate", "metal", str(folder), "--out", str(tmp_path / "c")]) == 3
+    status = main(["calibrate", "metal", str(folder), "--out", str(tmp_path / "c")])
+    assert status == DataError.exit_status
     assert not (tmp_path / "c").exists()
 
 
@@ -199,7 +200,8 @@ def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows
     """The board V moved between the two scans: its axes are the same, but not its phases."""
     other_scan = make_scan(tmp_path / "other", make_rig(V_MOVED, **SMALL), plates=[PLATE])
     out = tmp_path / "out"
-    assert main(["process", str(other_scan), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 3
+    options = ["--reference", str(plate), "--out", str(out), "--model", "none"]
+    assert main(["process", str(other_scan), *options]) == DataError.exit_status
     assert not (out / "image.npz").exists()
 
 
@@ -236,8 +238,7 @@ def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band
 def test_missing_sub_bands_are_refused_before_rows_are_read(full_metal, take_scan_with, tmp_path):
     scan = take_scan_with(full_metal)
     arguments = ["process", str(scan.path), "--bands", "2", "--out", str(tmp_path / "out"), "--model", "none"]
-    unusable_input = 3
-    assert main(arguments) == unusable_input
+    assert main(arguments) == DataError.exit_status
     assert not (tmp_path / "out" / "image.npz").exists()
 
 

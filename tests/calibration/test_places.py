@@ -86,8 +86,8 @@ def test_the_estimated_places_change_only_on_purpose(file):
     figures = msgspec.to_builtins(file)
     of_the_run = ("made_utc", "sources", "versions")
     kept_figures = {name: value for name, value in figures.items() if name not in of_the_run}
-    # Within one per cent
-    assert_kept(Path(__file__).parent / "kept" / "places.json", kept_figures, 0.01)
+    # Numbers near 0 may differ by 0.01: millimetres and degrees.
+    assert_kept(Path(__file__).parent / "kept" / "places.json", kept_figures, absolute=0.01)
 
 
 def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
@@ -124,17 +124,21 @@ def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
 
 
 def test_a_target_that_was_laid_up_to_12_mm_beside_its_place_is_found(case):
-    """To half a step of the coarse grid, from which the fit starts: it would end at another fringe."""
+    """The place is found on a coarse grid, to half a step, and the fit starts there.
+
+    From a start farther away the fit would end at a wrong place, at which the phases of the echoes agree as well.
+    """
     folder, _, believed, _ = case
     centre = np.array(specular_midpoint_m(believed, believed.receivers[0]))
     points_mm = np.array(POINTS)
     laid_mm = (-11.0, 8.5)
-    unknown = np.array([0.0, *laid_mm, 0.0])
+    # Depth of the plane, x and y of the target, and its turn
+    unknowns = np.array([0.0, *laid_mm, 0.0])
     boards = []
     for loaded in load_echoes(open_raw(folder, None), believed).values():
         # A few positions suffice without noise.
         board = replace(loaded, samples=loaded.samples[:, ::20], offsets_m=loaded.offsets_m[::20])
-        echoes = places._model_echoes(board, np.zeros(3), places._place_points(centre, points_mm, unknown))
+        echoes = places._model_echoes(board, np.zeros(3), places._place_points(centre, points_mm, unknowns))
         boards.append(replace(board, samples=echoes.sum(axis=1).reshape(board.samples.shape)))
     found_mm = places._find_target(boards, centre, points_mm)
     assert np.abs(np.subtract(found_mm, laid_mm)).max() <= places._STEP_MM / 2
@@ -192,7 +196,7 @@ def test_another_target_is_refused(case, few_echoes):
     other_target = [TargetPoint((-20.0, 31.0)), TargetPoint((0.0, 0.0)), TargetPoint((20.0, 31.0))]
     fit = fit_places(few_echoes, rig_of_file, other_target)
     with expect_refusal(ErrorCode.MISMATCH):
-        places_file(rig_of_file, fit, 3, [])
+        places_file(rig_of_file, fit, points=len(other_target), sources=[])
 
 
 def test_a_target_needs_three_points(tmp_path):

@@ -20,17 +20,8 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
     (folder / "base.toml").write_text(tomli_w.dumps(to_builtins(make_impatient_rig())))
     (folder / "scene.toml").write_text(SCENE)
     with closing(Bench(folder)) as bench:
-        options = (
-            "--config",
-            "base.toml",
-            "--with-pi",
-            "--scene",
-            "scene.toml",
-            "--dir",
-            folder / "rig",
-            "--time-scale",
-            "40",
-        )
+        options = ["--config", "base.toml", "--with-pi", "--scene", "scene.toml"]
+        options += ["--dir", str(folder / "rig"), "--time-scale", "40"]
         rig = bench.start("python", "-m", "polysight_simulators.rig", *options)
         rig.wait_ready()
         yield LiveRig(folder, folder / "rig" / "instrument.toml")

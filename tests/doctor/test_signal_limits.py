@@ -109,8 +109,8 @@ def test_a_board_starts_within_10_ns_of_the_transmitter(delay_ns, level):
 @pytest.mark.parametrize(
     ("expected_hz", "found", "words"),
     [
-        # A clock of 5 ns moves the IF by 194 kHz: the path must be so far from both ends of the band, 0 and 1935 kHz.
-        # It must be found in nine tenths of the 40 chirps.
+        # A trigger clock of 5 ns moves the IF by 194 kHz: the IF must be at least this far from both ends of the band,
+        # 0 and 1935 kHz. The path must be found in nine tenths of the 40 chirps.
         (195e3, 40, ""), (193e3, 40, "too near the edge"), (1740e3, 40, ""), (1742e3, 40, "too near the edge"),
         (900e3, 36, ""), (900e3, 35, "too near the edge"), (900e3, 20, "no direct path in 20 of 40"),
         (1936e3, 40, "outside 0..1935 kHz"), (-1e3, 40, "outside 0..1935 kHz"), (-1e3, 5, "no direct path in 35 of 40"),
@@ -148,7 +148,7 @@ def test_more_jitter_than_4_ns_of_one_receiver_is_a_warning(jitter_ns, level):
         signals = {"RH": make_signal(jitter_ns=rh_jitter_ns), "RV": make_signal(jitter_ns=rv_jitter_ns)}
         finding = judge_skew(RIG, signals)
         assert finding.level == level
-        # As above: that of one board, since the other one has no jitter
+        # The error is that of one board's mean, because the other board has no jitter.
         assert finding.facts["standard_error_ns"] == pytest.approx(jitter_ns / (CHIRPS - 1) ** 0.5, rel=1e-3)
 
 
@@ -202,6 +202,8 @@ def test_a_receiver_has_a_signal_of_its_own_and_not_much_less_than_the_others(le
 
 
 def test_without_a_complete_chirp_nothing_is_judged():
-    assert judge_words(make_words()[:1]).level == "note"
+    # The last chirp of these words, here the only one, is not complete.
+    words_of_one_chirp = make_words()[:1]
+    assert judge_words(words_of_one_chirp).level == "note"
     context: Any = SimpleNamespace(captured={})
     assert check_level(context, RIG.by_role("receive_h")).level == "note"

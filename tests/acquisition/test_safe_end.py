@@ -1,4 +1,7 @@
-"""Every end of a scan leaves the rig at rest; nothing moves without a request; errors name the rows that are safe."""
+"""Every end of a scan leaves the rig at rest, the stage moves only on request, and errors say how many rows are stored.
+
+A stored row is called safe in the messages: it is committed to the scan folder, and resuming the scan keeps it.
+"""
 
 import errno
 import io
@@ -15,18 +18,23 @@ from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
-from polysight.acquisition import pi_client, scan as running
+from polysight.acquisition import pi_client, scan
 from polysight.acquisition.control import StopRequest, ignore_hangup
 from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.ready import make_ready
 from polysight.acquisition.scan import resume_scan, run_scan
-from polysight.jobs import live_scan as live, live_scan as progress, process as processing
+from polysight.jobs import live_scan, process
 from polysight.settings import DEFAULT
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared import messages as m
 from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, ScanError, convert_os_error
 from polysight_shared.faults import PiFault, explain
+
+# Row 1 (rows count from 0) and its first take (takes count from 1), as a key of the fake Pi's faults.
+FIRST_TAKE_OF_ROW_1 = (1, 1)
+# Id of the scan of a `MovingPi`.
+OWN_SCAN = "mine"
 
 
 def list_motion_commands(pi) -> list[type]:
@@ -35,49 +43,66 @@ def list_motion_commands(pi) -> list[type]:
 
 
 class MovingPi(PiClient):
-    """A client of a Pi whose stage passes through `states` while `scan_id` runs: each answer has the next state."""
+    """The client of the scan `OWN_SCAN`; its Pi reports that the scan `running_id` runs.
 
-    def __init__(self, scan_id: str, states: list[str]) -> None:
-        self._scan_id = "mine"
-        self.running_id = scan_id
+    The stage is in the first of `states` until an abort. After it, each reading of the status moves the stage on to the
+    next state, up to the last one.
+    """
+
+    def __init__(self, running_id: str, states: list[str]) -> None:
+        self._scan_id = OWN_SCAN
+        self.running_id = running_id
         self.states = states
         self.aborts: list[str] = []
 
     def status(self) -> SimpleNamespace:
-        state = self.states.pop(0) if self.aborts and len(self.states) > 1 else self.states[0]
+        state = self.states[0]
+        is_last_state = len(self.states) == 1
+        if self.aborts and not is_last_state:
+            del self.states[0]
         return SimpleNamespace(scan_id=self.running_id, state=state)
 
     def abort(self, reason: str) -> None:
         self.aborts.append(reason)
 
 
-def test_after_an_abort_the_host_waits_until_the_stage_rests_or_a_time_limit(monkeypatch):
+def test_after_an_abort_the_host_waits_until_the_stage_rests(monkeypatch):
     monkeypatch.setattr(pi_client, "_POLL_S", 0.001)
-    pi = MovingPi("mine", ["running", "held", "done", "ready"])
+    pi = MovingPi(OWN_SCAN, ["running", "held", "done", "ready"])
     pi.come_to_rest("an error")
-    assert (pi.aborts, pi.states) == (["an error"], ["ready"])
+    assert pi.aborts == ["an error"]
+    assert pi.states == ["ready"]
+
+
+def test_after_an_abort_the_host_waits_for_a_stage_that_never_rests_up_to_a_time_limit(monkeypatch):
+    monkeypatch.setattr(pi_client, "_POLL_S", 0.001)
     monkeypatch.setattr(pi_client, "_REST_TIMEOUT_S", 0.01)
-    restless_pi = MovingPi("mine", ["running"])
+    restless_pi = MovingPi(OWN_SCAN, ["running"])
     restless_pi.come_to_rest("an error")
     assert restless_pi.aborts == ["an error"]
 
 
-@pytest.mark.parametrize("other", ["", "another", "z"])
-def test_a_run_of_another_host_is_not_aborted(other):
-    pi = MovingPi(other, ["running"])
+# No run at all, and two ids that come before and after `OWN_SCAN` in the alphabet.
+@pytest.mark.parametrize("running_id", ["", "another", "z"])
+def test_a_run_of_another_host_is_not_aborted(running_id):
+    pi = MovingPi(running_id, ["running"])
     pi.come_to_rest("an error")
     assert pi.aborts == []
 
 
 def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
-    """The scan reports its progress before BeginRun: at the first report it opens the folder for commands."""
+    """The first report of progress comes before the command BeginRun.
+
+    At that report `polysight scan` opens the folder in which other programs leave their request to stop
+    (`ControlFolder`).
+    """
     begun_at_reports = []
 
-    def note(p) -> None:
+    def note_if_run_has_begun(p) -> None:
         if p.phase not in ("connect", "warning"):
             begun_at_reports.append(m.BeginRun in list_motion_commands(rig.pi))
 
-    run_scan(rig.instrument, tmp_path / "s", progress=note)
+    run_scan(rig.instrument, tmp_path / "s", progress=note_if_run_has_begun)
     assert not begun_at_reports[0]
 
 
@@ -87,7 +112,7 @@ def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
 @pytest.mark.parametrize("fault", [int(PiFault.STAGE_ALARM), int(PiFault.JOURNAL_FULL)])
 def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_that_of_the_fault(rig, tmp_path, fault):
     """The Pi ends row 1 with this fault and stays in state `fault`, as after an emergency stop."""
-    rig.pi.fail_rows[1, 1] = fault
+    rig.pi.fail_rows[FIRST_TAKE_OF_ROW_1] = fault
     rig.pi.latched_reason = "stage alarm 14: the emergency stop is pressed"
     phases = []
     with expect_refusal(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
@@ -99,13 +124,14 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_that_of_the_fau
     # The stage was homed at the start only.
     assert list_motion_commands(rig.pi).count(m.Home) == 1
     assert list_motion_commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
-    ended = load_facts(tmp_path / "s", "scan_ended")[0]
-    assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
+    scan_ended = load_facts(tmp_path / "s", "scan_ended")[0]
+    assert scan_ended["exit_status"] == "fail"
+    assert scan_ended["remedy"] == e.value.remedy
 
 
 @pytest.mark.parametrize(("fault", "homes"), [(int(PiFault.STAGE_ALARM), 0), (int(PiFault.JOURNAL_FULL), 2)])
 def test_at_its_start_a_scan_homes_after_any_fault_but_that_of_the_stage(rig, tmp_path, fault, homes):
-    """An alarm of the stage may be its emergency stop, and a person has to look at it.
+    """A stage that reports an alarm may be in emergency stop, so that a person has to look at it first.
 
     `homes` is the number of homings: none, or one at the start and one at the end of the scan.
     """
@@ -122,67 +148,81 @@ def test_at_its_start_a_scan_homes_after_any_fault_but_that_of_the_stage(rig, tm
 
 
 def test_a_row_with_a_fault_that_does_not_last_is_retaken_without_homing(rig, tmp_path):
-    rig.pi.fail_rows[1, 1] = int(PiFault.HOST_LOST)
+    rig.pi.fail_rows[FIRST_TAKE_OF_ROW_1] = int(PiFault.HOST_LOST)
     assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
-    sent = list_motion_commands(rig.pi)
+    commands = list_motion_commands(rig.pi)
+    row_starts = [place for place, command in enumerate(commands) if command is m.RunRow]
+    first_row_start = row_starts[0]
+    last_row_start = row_starts[-1]
     # The stage is homed at the start, and not between rows.
-    assert sent.index(m.Home) < sent.index(m.RunRow)
-    last_row = len(sent) - 1 - sent[::-1].index(m.RunRow)
-    assert m.Home not in sent[sent.index(m.RunRow) : last_row]
+    assert commands.index(m.Home) < first_row_start
+    assert m.Home not in commands[first_row_start:last_row_start]
 
 
 def test_pi_that_restarted_between_rows_ends_the_scan_immediately(rig, tmp_path):
-    def answer(p) -> None:
+    def restart_pi_after_row_1(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.run = None
             rig.pi.homed = False
             rig.pi.state = "idle"
 
     with expect_refusal(ErrorCode.STAGE_NOT_READY) as e:
-        run_scan(rig.instrument, tmp_path / "s", progress=answer)
+        run_scan(rig.instrument, tmp_path / "s", progress=restart_pi_after_row_1)
     assert "2 of 4 rows are safe" in e.value.remedy
-    assert list_motion_commands(rig.pi).count(m.Home) == 1
+    homings_of_failed_scan = 1
+    assert list_motion_commands(rig.pi).count(m.Home) == homings_of_failed_scan
+    # A person requested the resumed scan: it homes the stage at its start, and after its last row.
+    homings_of_resumed_scan = 2
     assert resume_scan(tmp_path / "s").exit_status == "success"
-    # Once for the first scan; at the start of the resumed one, which a person requested, and after its last row.
-    assert list_motion_commands(rig.pi).count(m.Home) == 3
+    assert list_motion_commands(rig.pi).count(m.Home) == homings_of_failed_scan + homings_of_resumed_scan
 
 
 def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
-    def answer(p) -> None:
+    def let_another_host_begin_a_run_after_row_1(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.run = msgspec.structs.replace(rig.pi.run, scan_id="another")
 
     with expect_refusal(ErrorCode.STAGE_NOT_READY, "another"):
-        run_scan(rig.instrument, tmp_path / "s", progress=answer)
+        run_scan(rig.instrument, tmp_path / "s", progress=let_another_host_begin_a_run_after_row_1)
     assert m.Abort not in list_motion_commands(rig.pi)
 
 
 @pytest.mark.parametrize("state", ["idle", "homed"])
 def test_stage_that_is_not_ready_between_rows_is_not_homed(rig, tmp_path, state):
-    def answer(p) -> None:
+    def change_state_after_row_1(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.homed = state == "homed"
             rig.pi.state = state
 
     with expect_refusal(ErrorCode.STAGE_NOT_READY, repr(state)) as e:
-        run_scan(rig.instrument, tmp_path / "s", progress=answer)
+        run_scan(rig.instrument, tmp_path / "s", progress=change_state_after_row_1)
     assert "polysight-pi home" in e.value.remedy
     assert list_motion_commands(rig.pi).count(m.Home) == 1
 
 
+class SelfHomingPi:
+    """A Pi whose stage passes through `states`, one at each reading of the status; the scan must not home it."""
+
+    def __init__(self, states: list[str]) -> None:
+        self._states = iter(states)
+        self.event_socket = SimpleNamespace(poll=lambda _: None)
+
+    def status(self) -> SimpleNamespace:
+        return SimpleNamespace(state=next(self._states), scan_id="s", homed=True, fault=0, reason="")
+
+    def events(self) -> list:
+        return []
+
+    def home(self) -> None:
+        pytest.fail("the scan homed the stage itself")
+
+
 def test_homing_that_another_program_started_is_waited_for():
-    states = iter(["homing", "homing", "ready"])
-    status = SimpleNamespace(scan_id="s", homed=True, fault=0, reason="")
-    socket = SimpleNamespace(poll=lambda _: None)
-
-    def next_status():
-        return SimpleNamespace(**vars(status), state=next(states))
-
-    pi = SimpleNamespace(status=next_status, event_socket=socket, events=list, home=None)
-    assert make_ready(pi, StopRequest(), lambda *_: None, "s", first=False)
+    pi = SelfHomingPi(["homing", "homing", "ready"])
+    assert make_ready(pi, StopRequest(), notify=lambda *_: None, scan_id="s", first=False)
 
 
-# --- errors and the rows that are safe --------------------------------------------------------------------------------
+# --- errors, and the number of stored rows ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
@@ -190,44 +230,58 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, rece
     """For each board: the Pi gets Abort, and the error is reported before the queued rows are processed."""
     rig.pi.hang_at = {1}
     messages_at_end = []
-    release = threading.Event()
+    was_processing_held_at_end = []
+    may_process = threading.Event()
 
-    def progress(p) -> None:
-        if p.phase == "state" and (p.state, p.row) == ("running", 1):
+    def process_when_allowed(_: int) -> None:
+        may_process.wait(HANG_S)
+
+    def kill_receiver_and_allow_processing_at_end(p) -> None:
+        if p.phase == "state" and p.state == "running" and p.row == 1:
             os.kill(receivers[board], signal.SIGKILL)
         if p.phase == "end":
-            messages_at_end.append((release.is_set(), p.message))
-            release.set()
+            messages_at_end.append(p.message)
+            was_processing_held_at_end.append(not may_process.is_set())
+            may_process.set()
 
     with expect_refusal(ErrorCode.NO_ANSWER, board) as e:
-        run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None, progress=progress)
+        run_scan(
+            rig.instrument,
+            tmp_path / "s",
+            on_row=process_when_allowed,
+            progress=kill_receiver_and_allow_processing_at_end,
+        )
     assert "1 of 4 rows are safe" in e.value.remedy
     assert list_motion_commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
     assert rig.pi.hanging is None
-    scan = ScanFolder.load(tmp_path / "s")
-    assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
-    assert messages_at_end == [(False, f"{e.value.what}; 1 rows wait to be processed")]
+    folder = ScanFolder.load(tmp_path / "s")
+    last_event = rig.pi.journal[folder.scan_id][-1]
+    assert last_event.exit_status == "fail"
+    assert messages_at_end == [f"{e.value.what}; 1 rows wait to be processed"]
+    assert was_processing_held_at_end == [True]
 
 
-def test_every_error_names_the_rows_that_are_safe(rig, tmp_path, monkeypatch):
-    def commit(*_: object) -> None:
+def test_every_error_has_the_number_of_stored_rows(rig, tmp_path, monkeypatch):
+    def fail_to_commit(*_: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    monkeypatch.setattr(running, "commit_row", commit)
+    monkeypatch.setattr(scan, "commit_row", fail_to_commit)
     with pytest.raises(OSError, match=os.strerror(errno.EIO)) as e:
         run_scan(rig.instrument, tmp_path / "s")
-    safe = f"0 of 4 rows are safe; `polysight resume {tmp_path / 's'}` continues from there"
-    assert e.value.__notes__ == [safe]
-    assert convert_os_error(e.value).remedy.endswith(safe)
+    stored_rows = f"0 of 4 rows are safe; `polysight resume {tmp_path / 's'}` continues from there"
+    assert e.value.__notes__ == [stored_rows]
+    assert convert_os_error(e.value).remedy.endswith(stored_rows)
 
 
-def test_the_error_of_a_pi_that_is_lost_has_the_rows_that_are_safe(rig, tmp_path):
-    def answer(p) -> None:
+def test_the_error_of_a_pi_that_is_lost_has_the_number_of_stored_rows(rig, tmp_path):
+    more_replies_than_are_sent = 10_000
+
+    def lose_pi_after_row_1(p) -> None:
         if p.phase == "committed" and p.row == 1:
-            rig.pi.lose_replies = 10_000
+            rig.pi.lose_replies = more_replies_than_are_sent
 
     with expect_refusal(ErrorCode.NO_ANSWER) as e:
-        run_scan(rig.instrument, tmp_path / "s", progress=answer)
+        run_scan(rig.instrument, tmp_path / "s", progress=lose_pi_after_row_1)
     assert f"2 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
 
 
@@ -235,18 +289,18 @@ def test_the_error_of_a_pi_that_is_lost_has_the_rows_that_are_safe(rig, tmp_path
 
 
 def test_a_display_that_fails_does_not_end_the_scan(rig, tmp_path):
-    calls = []
+    reports = []
 
-    def answer(p) -> None:
-        calls.append(p)
+    def display_until_disk_is_full(p) -> None:
+        reports.append(p)
         if p.state == "running":
-            raise OSError(28, "No space left on device")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    result = run_scan(rig.instrument, tmp_path / "s", progress=answer)
+    result = run_scan(rig.instrument, tmp_path / "s", progress=display_until_disk_is_full)
     assert result.exit_status == "success"
-    # After its error it is not called any more.
-    assert calls[-1].state == "running"
-    assert [w for w in result.warnings if "No space left" in w]
+    # After its error the display is not called any more.
+    assert reports[-1].state == "running"
+    assert any(os.strerror(errno.ENOSPC) in warning for warning in result.warnings)
 
 
 class FullDisk(io.StringIO):
@@ -260,7 +314,7 @@ class FullDisk(io.StringIO):
 
 
 class ClosedPipe(io.TextIOWrapper):
-    """A pipe whose reader ends at `break_off`."""
+    """A pipe whose reader closes it at `break_off`."""
 
     def __init__(self) -> None:
         self._read, write = os.pipe()
@@ -273,64 +327,70 @@ class ClosedPipe(io.TextIOWrapper):
 @pytest.mark.parametrize("kind", [FullDisk, ClosedPipe])
 def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, monkeypatch, kind):
     """In row 1 the terminal closes (SIGHUP), and stdout and stderr fail."""
-    commands = []
-    streams = [kind(), kind()]
-    monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
-    no_rows = SimpleNamespace(add_row=lambda _: None, quality=SimpleNamespace(boards={}))
-    monkeypatch.setattr(processing, "Pipeline", lambda *_, **__: no_rows)
-    monkeypatch.setattr(
-        processing,
-        "make_products",
-        lambda *given, **_: commands.append(given) or SimpleNamespace(summary=str, exit_status=0),
-    )
-    monkeypatch.setattr(processing, "publish_images", lambda *_: None)
-    update = progress.ScanBar.update
+    stdout = kind()
+    stderr = kind()
+    idle_pipeline = SimpleNamespace(add_row=lambda _: None, quality=SimpleNamespace(boards={}))
+    processed_pipelines = []
 
-    def update_progress(bar, p) -> None:
-        if (p.phase, p.state, p.row) == ("state", "running", 1):
+    def make_no_products(pipeline, *_: object, **__: object) -> SimpleNamespace:
+        processed_pipelines.append(pipeline)
+        return SimpleNamespace(summary=lambda: "", exit_status=0)
+
+    monkeypatch.setattr(process, "check_inputs", lambda *_: None)
+    monkeypatch.setattr(process, "Pipeline", lambda *_, **__: idle_pipeline)
+    monkeypatch.setattr(process, "make_products", make_no_products)
+    monkeypatch.setattr(process, "publish_images", lambda *_: None)
+    update = live_scan.ScanBar.update
+
+    def close_terminal_in_row_1_and_update(bar, p) -> None:
+        if p.phase == "state" and p.state == "running" and p.row == 1:
             os.kill(os.getpid(), signal.SIGHUP)
-            for stream in streams:
-                stream.break_off()
+            stdout.break_off()
+            stderr.break_off()
         update(bar, p)
 
-    monkeypatch.setattr(progress.ScanBar, "update", update_progress)
+    monkeypatch.setattr(live_scan.ScanBar, "update", close_terminal_in_row_1_and_update)
     with monkeypatch.context() as patch:
-        patch.setattr(sys, "stderr", streams[0])
-        patch.setattr(sys, "stdout", streams[1])
+        patch.setattr(sys, "stderr", stderr)
+        patch.setattr(sys, "stdout", stdout)
         # Printing the summary, which comes last, fails.
         with suppress(OSError):
-            live.scan(config, tmp_path / "s", DEFAULT, truth=None, keep_incomplete=False, process=True)
-    for stream in streams:
-        stream.close()
+            live_scan.scan(config, tmp_path / "s", DEFAULT, truth=None, keep_incomplete=False, process=True)
+    stdout.close()
+    stderr.close()
     assert validate(tmp_path / "s") == []
-    assert len(commands) == 1
+    assert processed_pipelines == [idle_pipeline]
 
 
 def test_the_signal_of_a_closed_terminal_is_ignored_during_the_block_only():
     signals = []
-    earlier_handler = signal.signal(signal.SIGHUP, lambda *_: signals.append(1))
+
+    def note_signal(number: int, _: object) -> None:
+        signals.append(number)
+
+    earlier_handler = signal.signal(signal.SIGHUP, note_signal)
     try:
         with ignore_hangup():
             os.kill(os.getpid(), signal.SIGHUP)
         os.kill(os.getpid(), signal.SIGHUP)
-        wait_for(lambda: signals, "the signal")
-        # Only the second signal has reached the handler from before.
-        assert signals == [1]
+        wait_for(lambda: len(signals) > 0, "the signal")
+        # Only the second signal has reached the handler.
+        assert signals == [signal.SIGHUP]
     finally:
         signal.signal(signal.SIGHUP, earlier_handler)
 
 
-@pytest.mark.parametrize("error", [ValueError("oops"), ScanError("no images", "", "look")])
-def test_when_processing_fails_it_is_reported_that_every_row_is_there(config, tmp_path, monkeypatch, capsys, error):
-    monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
-
-    def broken(*_: object, **__: object):
+@pytest.mark.parametrize("error", [ValueError("oops"), ScanError("no images", why="", remedy="look")])
+def test_when_processing_fails_it_is_reported_that_every_row_is_committed(config, tmp_path, monkeypatch, capsys, error):
+    def fail_to_make_pipeline(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(processing, "Pipeline", broken)
+    monkeypatch.setattr(process, "check_inputs", lambda *_: None)
+    monkeypatch.setattr(process, "Pipeline", fail_to_make_pipeline)
     with pytest.raises(PolysightError) as e:
-        live.scan(config, tmp_path / "s", DEFAULT, truth=None, keep_incomplete=False, process=True)
-    assert str(error.args[0]) in e.value.what
+        live_scan.scan(config, tmp_path / "s", DEFAULT, truth=None, keep_incomplete=False, process=True)
+    message_of_error = error.args[0]
+    assert message_of_error in e.value.what
     assert "every row is committed" in capsys.readouterr().out
     assert f"polysight process {tmp_path / 's'}" in e.value.remedy
 
@@ -343,6 +403,8 @@ def test_a_complete_scan_succeeds_if_the_pi_run_cannot_be_ended(rig, tmp_path, m
 
     monkeypatch.setattr(PiClient, "end_run", refuse_end)
     result = run_scan(rig.instrument, tmp_path / "s")
-    assert (result.exit_status, result.folder.complete) == ("success", True)
-    assert any("the Pi did not write it down" in w for w in result.warnings)
-    assert [f["exit_status"] for f in load_facts(result.folder, "scan_ended")] == ["success"]
+    assert result.exit_status == "success"
+    assert result.folder.complete
+    assert any("the Pi did not write it down" in warning for warning in result.warnings)
+    ends = load_facts(result.folder, "scan_ended")
+    assert [end["exit_status"] for end in ends] == ["success"]

@@ -124,7 +124,7 @@ def make_row(path_m: float) -> SyncedRow:
     zeros = np.zeros(positions)
     return SyncedRow(
         samples=np.tile(direct_and_echo.astype(np.complex64), (receivers, positions, 1)),
-        sweep_hz=sweep_hz,
+        sweep_hz=sweep_hz.astype(np.float64),
         valid=np.ones(positions, bool),
         chirps=np.ones(positions, int),
         direct_hz=zeros,

@@ -24,7 +24,7 @@ from polysight_simulators.uno import (
     list_missing_packages,
 )
 
-# Findings of the sanitizers end the program; optimisation is that which their manuals advise.
+# Whatever a sanitizer finds ends the program. The manuals of the sanitizers advise this level of optimisation.
 _SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
 # These packages are for the emulator only.
 _EMULATOR_PACKAGES = ("libsimavr-dev", "libelf-dev")
@@ -79,7 +79,7 @@ def uno_programs() -> tuple[Path, Path]:
 
 @pytest.fixture
 def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., EmulatedUno]]:
-    """Makes emulated boards; takes the further arguments of EmulatedUno, and another image."""
+    """Function that makes emulated boards. It takes the arguments of EmulatedUno after the image, and another image."""
     with ExitStack() as unos:
 
         def make(image: Path = uno_programs[1], **arguments: object) -> EmulatedUno:
@@ -90,7 +90,7 @@ def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., Emulated
 
 @pytest.fixture
 def host(make_uno: Callable[..., EmulatedUno]) -> Host:
-    """A host at the serial line of an emulated board; greeted, switched on and homed."""
+    """A host at the serial line of an emulated board, which was greeted, switched on and homed."""
     return Host(make_uno(start=(300, 250))).prepare()
 
 

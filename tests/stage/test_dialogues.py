@@ -16,6 +16,7 @@ must be sent before an event of the stage go in one piece, or have seconds to sp
 Further tests: no flipped bit, lost byte or random bytes make any of these stages move.
 """
 
+import math
 import random
 from pathlib import Path
 
@@ -40,7 +41,7 @@ COMMANDS = (
 
 
 def list_damaged(line: bytes) -> list[bytes]:
-    """The line with each of its bits flipped, and the line without each of its bytes before the line end."""
+    """Copies of the line: in each another bit is flipped, or another byte before the line end is missing."""
     damaged_lines = []
     for bit in range(8 * len(line)):
         flipped = bytearray(line)
@@ -82,8 +83,7 @@ def test_random_bytes_move_nothing(talker, request: pytest.FixtureRequest):
     rng = random.Random(amount)
     talker.prepare()
     talker.has_stood_still()
-    # As many pieces as hold the amount; the last is a full one, too.
-    for _ in range(-(-amount // CHUNK_BYTES)):
+    for _ in range(math.ceil(amount / CHUNK_BYTES)):
         talker.send(rng.randbytes(CHUNK_BYTES))
         assert talker.has_stood_still()
         talker.received = b""

@@ -3,6 +3,7 @@
 import itertools
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from tests.support.stage.drivers import PortDriver
 from tests.support.stage.processes import COMMANDS, StageProcess, outlives_its_parent
 
 from polysight_shared.faults import StageError
+from polysight_shared.stage_line import Parameter
 from polysight_shared.wires import WireMotion
 
 # A step is 5 um.
@@ -111,9 +113,9 @@ def test_the_stage_ends_when_its_wires_are_closed(start: Start, speed: float):
     stage = start(speed)
     with closing(PortDriver(str(stage.link), speed)) as driver:
         driver.read_replies()
-        for command in (("HELLO",), ("SET", 1, 20_000), ("ENABLE", 1), ("HOME",)):
+        for command in (("HELLO",), ("SET", Parameter.HEARTBEAT, 20_000), ("ENABLE", 1), ("HOME",)):
             assert driver.send_command(*command).kind == "ok"
-        stage.wires.shutdown(2)
+        stage.wires.shutdown(socket.SHUT_RDWR)
         stage.process.wait(HANG_S)
 
 
@@ -128,7 +130,8 @@ def test_an_emulator_in_lockstep_ends_with_its_parent(uno_programs: tuple[Path, 
     program, image = uno_programs
     # So many cycles take years.
     assert not outlives_its_parent(uno_programs, "rest 1000000000000000\nrun 1000000000000000\n")
-    # This process's own parent is not the emulator's: for the emulator its parent has ended.
+    # The emulator is told that the parent of this process is its own. As that is wrong, it believes that its parent has
+    # ended.
     not_its_parent = str(os.getppid())
     with subprocess.Popen([program, "--parent", not_its_parent, image], stdin=subprocess.PIPE) as uno:
         assert uno.wait(HANG_S) == 0

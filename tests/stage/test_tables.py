@@ -88,7 +88,7 @@ def test_defaults_are_those_of_the_rig_file():
 
 
 def test_the_longest_status_fits_a_line():
-    """Each value has as many characters as it may have; a line that is too long is not encoded."""
+    """Each value has its greatest number of characters. `encode` would refuse a line that is too long."""
     fields = {"state": "alarm", "x": "-1099999", "y": "-1099999", "points": "9999", "pulses": "9999"}
     Reply("status", fields={**fields, "alarm": "15", "limits": "7", "homed": "1"}).encode()
 
@@ -119,7 +119,8 @@ def test_examples_of_the_page_are_valid_lines():
 
 
 def test_sketch_fits_an_uno(built: tuple[Path, str]):
-    sizes = dict(re.findall(r"^(Program|Data): +(\d+) bytes", built[1], re.MULTILINE))
+    _, output = built
+    sizes = dict(re.findall(r"^(Program|Data): +(\d+) bytes", output, re.MULTILINE))
     # The flash has 32 KiB, of which the boot loader takes 512 bytes.
     assert int(sizes["Program"]) < 32 * 1024 - 512
     # Of the 2 KiB of memory a quarter is left for the stack.
@@ -128,9 +129,11 @@ def test_sketch_fits_an_uno(built: tuple[Path, str]):
 
 def test_the_sketch_has_no_floating_point(built: tuple[Path, str]):
     """No routine of the compiler's soft floating point is linked: it would be too slow between two steps."""
-    elf = str(built[0] / "arduino_stage.elf")
-    symbols = subprocess.run(["avr-nm", elf], capture_output=True, text=True, check=True).stdout
-    # The list of symbols has the interrupt of the steps: it is the right one.
+    folder, _ = built
+    symbols = subprocess.run(
+        ["avr-nm", folder / "arduino_stage.elf"], capture_output=True, text=True, check=True
+    ).stdout
+    # The interrupt of the steps is in the list, so that this is the list of the sketch's symbols.
     assert " __vector_11" in symbols
     assert not re.findall(r"\b__\w*(?:sf|fp|float)\w*", symbols)
 
@@ -145,7 +148,8 @@ def test_the_arduino_ide_makes_the_same_image(built: tuple[Path, str], tmp_path:
     command += ["-prefs", "compiler.cpp.extra_flags=-DDECIMAL_DIG=__DECIMAL_DIG__", str(SKETCH / "arduino_stage.ino")]
     compilation = subprocess.run(command, capture_output=True, text=True, check=False)
     assert compilation.returncode == 0, compilation.stderr
-    our_image = (built[0] / "arduino_stage.hex").read_bytes()
+    folder, _ = built
+    our_image = (folder / "arduino_stage.hex").read_bytes()
     assert (tmp_path / "arduino_stage.ino.hex").read_bytes() == our_image
 
 
@@ -178,18 +182,18 @@ class BootLoader:
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
-    def _take(self, n: int) -> bytes:
+    def _take(self, size: int) -> bytes:
         data = b""
-        while len(data) < n:
-            data += os.read(self._far, n - len(data))
+        while len(data) < size:
+            data += os.read(self._far, size - len(data))
         return data
 
     def _serve(self) -> None:
         address = 0
         while (command := self._take(1)) != b"\x00":
             answer = b""
-            # Get parameter
             if command == b"A":
+                # Get parameter
                 self._take(1)
                 answer = b"\x03"
             elif command == b"B":
@@ -243,18 +247,20 @@ def flash(folder: Path, port: str) -> subprocess.CompletedProcess[str]:
 def test_make_flash_writes_the_image_to_the_board_and_verifies_it(built: tuple[Path, str]):
     if shutil.which("avrdude") is None:
         pytest.skip("no avrdude: `sudo apt-get install avrdude` runs this too")
+    folder, _ = built
     board = BootLoader()
     try:
-        process = flash(built[0], board.port)
+        process = flash(folder, board.port)
     finally:
         board.close()
     assert process.returncode == 0, process.stderr
-    image = read_hex(built[0] / "arduino_stage.hex")
+    image = read_hex(folder / "arduino_stage.hex")
     assert board.flash.startswith(image)
     assert "verified" in process.stderr
 
 
 def test_make_flash_without_a_port_asks_for_one(built: tuple[Path, str]):
-    process = flash(built[0], "")
+    folder, _ = built
+    process = flash(folder, port="")
     assert process.returncode != 0
     assert "make flash PORT=/dev/ttyACM0" in process.stdout

@@ -24,7 +24,10 @@ SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm =
 
 @pytest.mark.usefixtures("uno_programs")
 def test_echoes_of_a_scan_are_those_of_the_planned_positions(tmp_path: Path):
-    """The simulated radars compute echoes where the emulated stage is. A scan without a stage has the same ones."""
+    """The simulated radars compute echoes for the position of the emulated stage.
+
+    They are those of a simulated scan without a stage, whose positions are the planned ones.
+    """
     rig = load_published_rig()
     replace = msgspec.structs.replace
     rig = replace(

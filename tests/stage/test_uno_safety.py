@@ -11,13 +11,14 @@ from polysight_shared.faults import StageError
 from polysight_shared.stage_line import Immediate, Parameter
 from polysight_simulators.uno import HZ
 
+# Cycles of the processor in a microsecond and in a millisecond.
 US = HZ // 1_000_000
 MS = HZ // 1000
 # Pins of the UNO.
 TRIGGER = 2
 X_PUL = 5
 DRIVERS_OFF = 7
-# Time of the watchdog; its oscillator is accurate to 10 per cent.
+# Time after which the watchdog resets a program; its oscillator is accurate to 10 per cent.
 WATCHDOG_MS = 250 * 1.1
 # Highest rate of the stage, steps per second.
 TOP_RATE = 20_000
@@ -58,6 +59,7 @@ def test_other_traffic_is_not_a_heartbeat(host, kind: str):
     host.uno.settle()
     host.uno.run_ms(50)
     host.uno.received.clear()
+    # The last line of the traffic may be incomplete.
     host.uno.feed(b"\n")
     host.uno.run_ms(20)
     host.uno.received.clear()
@@ -91,8 +93,10 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
         host.uno.run_ms(25)
 
     assert host.uno.troubles == ["watchdog"]
-    assert [e.cycle for e in host.uno.edges if e.pin == X_PUL and e.value][-1] <= hung + WATCHDOG_MS * MS
-    assert [(e.pin, e.value) for e in host.uno.edges][-1] == (DRIVERS_OFF, 1)
+    last_step = max(e.cycle for e in host.uno.edges if e.pin == X_PUL and e.value)
+    assert last_step <= hung + WATCHDOG_MS * MS
+    last_edge = host.uno.edges[-1]
+    assert (last_edge.pin, last_edge.value) == (DRIVERS_OFF, 1)
     replies = host.read_replies()
     assert replies[0].kind == "banner"
     assert replies[-1].integer("homed") == 0
@@ -108,9 +112,12 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
 
 
 def test_a_program_that_works_is_never_reset(host):
-    """Rows for four seconds, with the longest lines and status requests between: the watchdog's 250 ms do not pass."""
-    for turn in range(4):
-        host.must_obey("ROW", 6000, 40, 150, 400 * (turn % 2), TOP_RATE)
+    """The stage moves, and reads the longest lines and status requests, for four seconds without a reset.
+
+    The watchdog would reset a program that is busy with one thing for 250 ms.
+    """
+    for y in (0, 400, 0, 400):
+        host.must_obey("ROW", 6000, 40, 150, y, TOP_RATE)
         for _ in range(40):
             host.uno.feed(b"N1 SET 0 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9*0000\n" * 4)
             host.uno.feed(bytes([Immediate.STATUS]))
@@ -148,7 +155,7 @@ def test_a_glitch_is_not_a_switch(host, request: pytest.FixtureRequest, mask: in
 @pytest.mark.parametrize("rate", [500, 4000, TOP_RATE])
 @pytest.mark.parametrize(("mask", "number"), [(1, StageError.LIMIT_SWITCH), (4, StageError.EMERGENCY_STOP)])
 def test_a_real_switch_stops_immediately(host, rate: int, mask: int, number: int):
-    """A switch that is really hit stays closed for 15 ms at least. The stage stops within six steps (30 um)."""
+    """The stage stops within six steps (30 um) of a hit switch, which stays closed for 15 ms at least."""
     most_steps = 6
     host.set(Parameter.ACCEL, 400_000)
     host.uno.watch(X_PUL)
@@ -163,6 +170,7 @@ def test_a_real_switch_stops_immediately(host, rate: int, mask: int, number: int
     steps = [e.cycle for e in host.uno.edges if e.value]
     assert len(steps) <= most_steps
     if steps:
+        # A step takes HZ / rate cycles.
         assert steps[-1] <= pressed + most_steps * HZ // rate
     host.uno.press(0)
     host.uno.run_ms(50)
@@ -170,7 +178,7 @@ def test_a_real_switch_stops_immediately(host, rate: int, mask: int, number: int
 
 
 def test_no_stray_byte_ends_a_hold(host):
-    """No byte but STOP moves the stage or ends the row during a hold; RESUME continues the row."""
+    """During a hold only STOP ends the row and only RESUME continues it: other bytes do not move the stage."""
     host.uno.watch(X_PUL)
     host.must_obey("ROW", 4000, 200, 60, 500, 4000)
     host.uno.run_ms(1200)
@@ -206,7 +214,11 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
 
 def test_homing_reports_the_lost_steps(host):
     host.run_motion("MOVE", 9000, 700, TOP_RATE)
-    host.uno.slip(-7, 12)
-    answer = host.run_motion("HOME")
-    assert (answer.integer("lostx"), answer.integer("losty")) == (-7, 12)
-    assert (host.run_motion("HOME").integer("lostx"), answer.integer("x"), answer.integer("y")) == (0, 0, 0)
+    lost_x = -7
+    lost_y = 12
+    host.uno.slip(lost_x, lost_y)
+    homed = host.run_motion("HOME")
+    assert (homed.integer("lostx"), homed.integer("losty")) == (lost_x, lost_y)
+    assert (homed.integer("x"), homed.integer("y")) == (0, 0)
+    homed_again = host.run_motion("HOME")
+    assert homed_again.integer("lostx") == 0

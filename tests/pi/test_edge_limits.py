@@ -6,7 +6,7 @@ import pytest
 
 from polysight_pi.edges import EdgeTimes, RowMotion, slowest_feed
 
-# Four points 400 steps apart at 4,000 steps/s: 100 ms each. A step is 1/200 mm, so these are 2 mm at 20 mm/s.
+# Four points 400 steps (2 mm) apart, at 4,000 steps/s (20 mm/s): from one point to the next the stage takes 100 ms.
 MOTION = RowMotion(x_start=10_000, step=400, points=4, y=500, feed=4000, accel=40_000, backlash=0)
 MS = 1_000_000
 BEGIN_NS = 5_000 * MS
@@ -72,7 +72,8 @@ def test_points_of_a_row_pass_at_its_speed_between_two_ramps():
 @pytest.mark.parametrize(
     ("interval_ms", "problem"),
     [
-        # One percent is 1 ms; of two intervals together each has its 1 ms, and of three.
+        # One percent of an interval is 1 ms. If edges are lost, two or three intervals come together: their limit is
+        # 2 ms or 3 ms.
         (100.0, ""), (100.9, ""), (99.1, ""), (101.1, "a late edge, or lost edges"), (98.9, "a spurious or early edge"),
         (200.0, "1 edges lost"), (201.9, "1 edges lost"), (198.1, "1 edges lost"),
         (202.1, "a late edge, or lost edges"),
@@ -141,7 +142,10 @@ def test_a_row_that_ends_too_soon_after_its_last_edge_is_a_fault():
     ],
 )  # fmt: skip
 def test_a_hold_lengthens_the_interval_in_which_the_stage_rests_and_no_other(x, points, waits):
-    """`waits`: points before which the stage may have waited. It waits 7 s in each interval in turn."""
+    """`waits` are the points before which the stage may have waited. It waits 7 s in each interval in turn.
+
+    The row is sound exactly if the wait is in an interval in which the stage rested.
+    """
     for waiting_point in (1, 2, 3):
         check, _ = note_edges()
         check.note_hold()

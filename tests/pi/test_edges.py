@@ -15,7 +15,7 @@ from polysight_pi.edges import RowMotion
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault, StageError
 from polysight_shared.raster import Row, Stage
-from polysight_shared.stage_line import Command, Immediate, Reply
+from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
 from polysight_shared.wires import WireEdge
 from polysight_simulators.stage.motion import NS_PER_TICK, TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig
@@ -51,16 +51,26 @@ class Recorder:
         self.happenings: list[Happening] = []
         self._rng = rng
         self._stage = PythonStage(Rig())
-        self._tick = self._sequence = self._edges = self._bytes_sent = 0
+        self._tick = 0
+        self._sequence = 0
+        # Numbers of edges, and of immediate bytes to the stage, that were handed on.
+        self._edges = 0
+        self._bytes_sent = 0
         accel = round(accel_mm_s2 * self.config.steps_per_mm)
         motion = RowMotion.plan(ROW, self.config, speed_mm_s)
-        for verb, *args in (("HELLO",), ("SET", 0, accel), ("SET", 1, 60_000), ("ENABLE", 1), ("HOME",)):
-            self._send(str(verb), *map(int, args))
+        self._send("HELLO")
+        self._send("SET", Parameter.ACCEL, accel)
+        self._send("SET", Parameter.HEARTBEAT, 60_000)
+        self._send("ENABLE", 1)
+        self._send("HOME")
         while b"done" not in self._stage.replies:
             self._advance(0.01)
         self._bench = make_bench(self)
         # Near the row, so that the travel to it is short.
-        self._send("MOVE", motion.x_start - 2 * motion.run_up, motion.y - 200, 18_000)
+        x = motion.x_start - 2 * motion.run_up
+        y = motion.y - 200
+        rate = 18_000
+        self._send("MOVE", x, y, rate)
         while self._stage.replies.count(b"done") < 2:
             self._advance(0.01)
         self._stage.wires.clear()
@@ -83,13 +93,15 @@ class Recorder:
     def run(self, holds: list[tuple[float, float]], early_hold_s: float | None = None) -> list[Happening]:
         """Run the row with these holds: each a time after the first point and a duration, seconds.
 
-        `early_hold_s`: one hold of 0.6 s, so long after the command ROW, instead.
+        With `early_hold_s` there is instead one hold of 0.6 s, which begins `early_hold_s` seconds after the command
+        ROW.
         """
         commands: list[tuple[int, str]] = []
         if early_hold_s is not None:
             begin_ns = self._tick * NS_PER_TICK + round(early_hold_s * 1e9)
             commands = [(begin_ns, "Hold"), (begin_ns + 600_000_000, "Resume")]
-        status_asked_ns = next_status = 0
+        status_asked_ns = 0
+        next_status_ns = 0
         while True:
             self._advance(0.001)
             now_ns = self._tick * NS_PER_TICK
@@ -112,9 +124,9 @@ class Recorder:
                     self._reply(Reply.decode(line), status_asked_ns, now_ns)
                 if b"done" in raw:
                     return self.happenings
-            if now_ns >= next_status:
+            if now_ns >= next_status_ns:
                 status_asked_ns = now_ns
-                next_status = now_ns + round(STATUS_S * 1e9)
+                next_status_ns = now_ns + round(STATUS_S * 1e9)
                 self._stage.receive(Immediate.STATUS.sent)
 
     def _reply(self, reply: Reply, asked_ns: int, now_ns: int) -> None:
@@ -197,11 +209,11 @@ def draw_fault(rng: random.Random, recorder: Recorder, interval_ns: int) -> tupl
 def are_equal(edges_ns: list[int], sound_ns: list[int], tolerance_ns: float) -> bool:
     """True if these are the sound edges within a tolerance."""
     pairs = zip(edges_ns, sound_ns, strict=False)
-    return len(edges_ns) == len(sound_ns) and all(abs(a - b) <= tolerance_ns for a, b in pairs)
+    return len(edges_ns) == len(sound_ns) and all(abs(edge - sound) <= tolerance_ns for edge, sound in pairs)
 
 
 def has_no_hold_at_its_ends(recorder: Recorder) -> bool:
-    """True if no hold is in the first or last interval: a wait there hides the shift of the outermost edge."""
+    """True if no hold was in the first or last interval: a wait there hides a shift of the first or last edge."""
     replies = [h.what for h in recorder.happenings if isinstance(h.what, Reply)]
     held_after = [int(r.fields["points"]) for r in replies if r.fields.get("state") == "hold"]
     return all(2 <= points <= POINTS - 2 for points in held_after)

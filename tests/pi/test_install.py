@@ -4,6 +4,7 @@ import configparser
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,13 @@ from tests.support.paths import REPO, RIG_FILE
 from tests.support.processes import HANG_S
 from tests.support.rigs import load_published_rig
 
+from polysight_pi.system import TRIGGER_PRIORITY
+
 PI = REPO / "pi_controller"
+# Exit statuses of install.sh
+SUCCESS = 0
+USAGE_ERROR = 2
+FAILURE = 5
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
 # Shell script in place of a command that would change this machine: it only records its arguments.
 STUB = '#!/bin/sh\necho "$(basename "$0") $*" >> "$LOG"\n'
@@ -92,8 +99,7 @@ def test_the_unit_leaves_the_address_families_that_zeromq_needs(unit):
 
 def test_the_unit_gives_what_the_program_asks_for(unit):
     service = unit["Service"]
-    # The highest priority of a thread (`TRIGGER_PRIORITY`).
-    assert int(service["LimitRTPRIO"]) >= 50
+    assert int(service["LimitRTPRIO"]) >= TRIGGER_PRIORITY
     assert service["LimitMEMLOCK"] == "infinity"
     assert {"gpio", "spi", "dialout"} <= set(service["SupplementaryGroups"].split())
     rig = load_published_rig()
@@ -178,15 +184,15 @@ def test_installing_twice_keeps_the_rig_file_and_other_files_in_the_users_home(b
     log = tmp_path / "log"
     (tmp_path / "home/polysight/notes").write_text("mine")
     make = ["make", "pi-install", "HOST=pi@here", f"VENV={tmp_path}", f"BIN={tmp_path}/bin", f"OUT={tmp_path}/out"]
-    for rig_file in (None, "mine"):
-        if rig_file:
-            (root / "etc/polysight/instrument.toml").write_text(rig_file)
+    for is_first_installation in (True, False):
+        if not is_first_installation:
+            (root / "etc/polysight/instrument.toml").write_text("mine")
             log.unlink()
         process = subprocess.run(make, cwd=REPO, env=bench, capture_output=True, text=True, check=False)
         assert process.returncode == 0, process.stdout + process.stderr
         log_text = log.read_text()
         # The environment is made once, and kept with its libraries.
-        assert log_text.count("-m venv") == (rig_file is None)
+        assert log_text.count("-m venv") == (1 if is_first_installation else 0)
         steps = ("pip wheel", "pip install --quiet --retries", "--force-reinstall", "try-restart")
         order = [log_text.index(step) for step in steps]
         assert order == sorted(order)
@@ -206,8 +212,8 @@ def test_installing_twice_keeps_the_rig_file_and_other_files_in_the_users_home(b
     assert (opt / "venv").readlink() == Path("releases/2")
     roll_back = [PI / "install.sh", "--roll-back"]
     statuses = [subprocess.run(roll_back, env=bench, check=False).returncode for _ in range(2)]
-    # The first one leads to the first release; there is none before that.
-    assert statuses == [0, 5]
+    # The first roll-back leads to the first release; there is none before that.
+    assert statuses == [SUCCESS, FAILURE]
     assert (opt / "venv").readlink() == Path("releases/1")
     assert (opt / "venv/bin/python").is_file()
 
@@ -218,20 +224,20 @@ def test_a_machine_that_is_not_a_pi_is_not_changed(install, bench, tmp_path):
     del bench["ROOT"]
     for arguments in ((), ("--roll-back",)):
         process = install(*arguments)
-        assert process.returncode == 2
+        assert process.returncode == USAGE_ERROR
         assert "not a Raspberry Pi" in process.stderr
     assert not (tmp_path / "log").exists(), "no command was run"
 
 
 def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):
-    assert install().returncode == 0
+    assert install().returncode == SUCCESS
     opt = tmp_path / "root/opt/polysight"
     log = tmp_path / "log"
     releases_before = sorted(p.name for p in (opt / "releases").iterdir())
     (opt / "venv/bin/python").write_text(STUB + "exit 1\n")
     log.unlink()
     failed = install()
-    assert failed.returncode == 5
+    assert failed.returncode == FAILURE
     assert "internet" in failed.stderr
     # The running service is not touched.
     assert "systemctl" not in log.read_text()
@@ -242,14 +248,14 @@ def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):
 def test_an_unfinished_release_is_never_used(install, tmp_path):
     """Power is lost while pip installs: the release's folder exists but must not become active."""
     opt = tmp_path / "root/opt/polysight"
-    assert install().returncode == 0
+    assert install().returncode == SUCCESS
     python = opt / "venv/bin/python"
     python_text = python.read_text()
-    # Kills the script that called it.
+    # This program kills the script that has called it.
     python.write_text(STUB + "kill -9 $PPID\n")
-    assert install().returncode == -9
+    assert install().returncode == -signal.SIGKILL
     assert (opt / "venv").readlink() == Path("releases/1")
     python.write_text(python_text)
-    assert install().returncode == 0
-    assert install("--roll-back").returncode == 0
+    assert install().returncode == SUCCESS
+    assert install("--roll-back").returncode == SUCCESS
     assert (opt / "venv").readlink() == Path("releases/1")

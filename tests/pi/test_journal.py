@@ -34,22 +34,29 @@ from polysight_shared.raster import RasterPlan
 
 # Bytes of a record before its payload.
 HEAD_BYTES = 12
+# Any plan: the journal stores it as it is.
+PLAN = RasterPlan(columns=2, rows=2, step_x_mm=1.0, step_y_mm=1.0)
 payloads = st.lists(st.binary(max_size=40), max_size=12)
 
 
 def write_records(path, records):
+    """Write a new journal; return the bytes of its file."""
     path.unlink(missing_ok=True)
-    j = JournalFile(path)
-    j.write(records)
-    j.close()
+    journal = JournalFile(path)
+    journal.write(records)
+    journal.close()
     return path.read_bytes()
+
+
+def read_all(journal):
+    return journal.read(from_seq=1, limit=10**6)
 
 
 def read_again(path):
     """Open the journal as the next program does; return its records."""
-    j = JournalFile(path)
-    events = j.read(1, 10**6)
-    j.close()
+    journal = JournalFile(path)
+    events = read_all(journal)
+    journal.close()
     return events
 
 
@@ -67,11 +74,11 @@ def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, 
     raw = write_records(path, records)
     # Lengths of the file after the magic, and after each record.
     ends = [len(MAGIC)]
-    for r in records:
-        ends.append(ends[-1] + HEAD_BYTES + len(r))
+    for record in records:
+        ends.append(ends[-1] + HEAD_BYTES + len(record))
     for cut in range(len(raw) + 1):
         path.write_bytes(raw[:cut])
-        complete_records = max(0, sum(e <= cut for e in ends) - 1)
+        complete_records = sum(end <= cut for end in ends[1:])
         assert read_again(path) == records[:complete_records]
         assert path.stat().st_size == ends[complete_records]
 
@@ -87,31 +94,35 @@ def test_a_damaged_byte_loses_only_the_events_after_it(tmp_path_factory, records
     events = read_again(path)
     assert events == records[: len(events)]
     # The records that are left end before the damaged byte.
-    assert len(MAGIC) + sum(HEAD_BYTES + len(r) for r in records[: len(events)]) <= position
+    assert len(MAGIC) + sum(HEAD_BYTES + len(event) for event in events) <= position
 
 
 def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
     published = []
     journal = Journal(tmp_path, published.extend)
-    journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    journal.open("s", PLAN, host_seq=0)
     # The thread is not started: the test runs its jobs.
     thread = JournalThread(journal)
     for _ in range(2):
         thread.add(RunStopped, exit_status="abort")
-    assert (journal.last_seq, journal.read("s", 1, 9)[0], published) == (0, [], [])
-    thread.commit(lambda _: None)
+    stored, _ = journal.read("s", from_seq=1, limit=9)
+    assert journal.last_seq == 0
+    assert stored == []
+    assert published == []
+    thread.commit(then=lambda _: None)
     thread.do_waiting()
-    assert [unpack_event(raw).seq for raw in journal.read("s", 1, 9)[0]] == [1, 2]
+    stored, _ = journal.read("s", from_seq=1, limit=9)
+    assert [unpack_event(raw).seq for raw in stored] == [1, 2]
     assert [unpack_event(raw).seq for raw in published] == [1, 2]
     journal.close()
 
 
-# Bytes that the disk still takes of two records of 18 bytes: none, a part of the first head, a part of the first
-# payload, and the first record with a part of the second head.
+# Bytes that the disk still accepts. Each of the two records has a head of 12 bytes and a payload of 6. The disk becomes
+# full before the first head, within it, within the first payload, and within the second head.
 @pytest.mark.parametrize("room", [0, 1, 13, 25])
 def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
-    j = JournalFile(tmp_path / "a.journal")
-    j.write([b"kept"])
+    journal = JournalFile(tmp_path / "a.journal")
+    journal.write([b"kept"])
     pwrite = os.pwrite
     bytes_left = room
 
@@ -124,13 +135,14 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
         return written_bytes
 
     monkeypatch.setattr(journal_module.os, "pwrite", fill_disk)
-    with expect_refusal(ErrorCode.DISK_FULL, j.path, "No space left"):
-        j.write([b"lost 1", b"lost 2"])
-    assert (j.last_seq, j.read(1, 9)) == (1, [b"kept"])
+    with expect_refusal(ErrorCode.DISK_FULL, journal.path, "No space left"):
+        journal.write([b"lost 1", b"lost 2"])
+    assert journal.last_seq == 1
+    assert read_all(journal) == [b"kept"]
     monkeypatch.undo()
-    j.write([b"again"])
-    assert j.last_seq == 2
-    j.close()
+    journal.write([b"again"])
+    assert journal.last_seq == 2
+    journal.close()
     assert read_again(tmp_path / "a.journal") == [b"kept", b"again"]
 
 
@@ -162,19 +174,21 @@ def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, la
     """
     path = tmp_path_factory.mktemp("j") / "a.journal"
     write_records(path, first)
-    j = JournalFile(path)
-    assert j.continue_after(last_seq) == max(0, last_seq - len(first))
-    begin = max(last_seq, len(first)) + 1
-    j.write(second)
-    j.close()
-    j = JournalFile(path)
-    numbered = {i + 1: r for i, r in enumerate(first)} | {begin + i: r for i, r in enumerate(second)}
-    assert j.last_seq == max(numbered, default=0)
-    expected = [r for n, r in numbered.items() if n >= seq][:limit]
-    assert j.read(seq, limit) == expected
-    j.close()
+    journal = JournalFile(path)
+    assert journal.continue_after(last_seq) == max(0, last_seq - len(first))
+    journal.write(second)
+    journal.close()
+
+    first_new_seq = max(last_seq, len(first)) + 1
+    record_of_seq = dict(enumerate(first, start=1)) | dict(enumerate(second, start=first_new_seq))
+    newest_seq = max(record_of_seq, default=0)
+    expected = [record for number, record in record_of_seq.items() if number >= seq][:limit]
+    journal = JournalFile(path)
+    assert journal.last_seq == newest_seq
+    assert journal.read(seq, limit) == expected
+    journal.close()
     folder = Journal(path.parent)
-    assert folder.read("a", seq, limit) == (expected, max(numbered, default=0))
+    assert folder.read("a", seq, limit) == (expected, newest_seq)
     folder.close()
 
 
@@ -184,53 +198,56 @@ def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, la
 def test_a_new_journal_torn_by_a_power_cut_is_empty(tmp_path, remaining_bytes):
     path = tmp_path / "a.journal"
     path.write_bytes(remaining_bytes)
-    j = JournalFile(path)
-    assert (j.last_seq, path.read_bytes()) == (0, MAGIC)
-    j.write([b"x"])
-    assert j.last_seq == 1
-    j.close()
+    journal = JournalFile(path)
+    assert journal.last_seq == 0
+    assert path.read_bytes() == MAGIC
+    journal.write([b"x"])
+    assert journal.last_seq == 1
+    journal.close()
     assert read_again(path) == [b"x"]
 
 
 def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
     path = tmp_path / "a.journal"
-    raw = bytearray(write_records(path, [b"one", b"two", b"three", b"four"]))
-    position = raw.index(b"two")
-    # The copy of a second damage has a name of its own.
-    for number in ("", "2"):
-        raw[position] ^= 1
-        path.write_bytes(raw)
-        j = JournalFile(path)
+    raw = write_records(path, [b"one", b"two", b"three", b"four"])
+    # The copy of a file that is damaged again has another name.
+    for damaged, number in ((b"0wo", ""), (b"t0o", "2")):
+        damaged_content = raw.replace(b"two", damaged)
+        path.write_bytes(damaged_content)
+        journal = JournalFile(path)
         copy = path.with_name(path.name + DAMAGED_SUFFIX + number)
-        assert (j.last_seq, j.read(1, 9), copy.read_bytes()) == (1, [b"one"], bytes(raw))
-        assert str(copy) in j.damage
-        j.close()
-        raw[position] ^= 1
-        position = raw.index(b"two") + 1
+        assert journal.last_seq == 1
+        assert read_all(journal) == [b"one"]
+        assert copy.read_bytes() == damaged_content
+        assert str(copy) in journal.damage
+        journal.close()
 
 
 @given(records=st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=6), data=st.data())
 @settings(max_examples=40, deadline=None)
-def test_a_torn_tail_is_not_damage(tmp_path_factory, records, data):
+def test_an_incomplete_last_record_is_not_damage(tmp_path_factory, records, data):
+    """A power cut may leave a file short, or with zeros at its end."""
     path = tmp_path_factory.mktemp("j") / "a.journal"
     raw = write_records(path, records)
-    path.write_bytes(raw[: data.draw(st.integers(0, len(raw)))] + bytes(data.draw(st.sampled_from([0, 1, 4096]))))
-    j = JournalFile(path)
-    assert j.damage == ""
-    j.close()
+    length = data.draw(st.integers(0, len(raw)))
+    added_zeros = data.draw(st.sampled_from([0, 1, 4096]))
+    path.write_bytes(raw[:length] + bytes(added_zeros))
+    journal = JournalFile(path)
+    assert journal.damage == ""
+    journal.close()
     assert not list(path.parent.glob("*" + DAMAGED_SUFFIX + "*"))
 
 
 def test_a_damaged_journal_is_logged(tmp_path):
     warnings: list[str] = []
     journal = Journal(tmp_path, warn=warnings.append)
-    journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    journal.open("s", PLAN, host_seq=0)
     journal.close()
     path = journal.journal_path("s")
     raw = write_records(path, [b"one", b"two", b"three"]).replace(b"one", b"0ne")
     path.write_bytes(raw)
     journal = Journal(tmp_path, warn=warnings.append)
-    journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    journal.open("s", PLAN, host_seq=0)
     assert len(warnings) == 1
     assert DAMAGED_SUFFIX in warnings[0]
     journal.close()
@@ -274,7 +291,7 @@ def test_a_row_that_is_not_journalled_is_not_done(tmp_path, monkeypatch):
     """A row that ends after the disk was full, before the run is stopped, is a fault, too."""
     published = []
     folder = Journal(tmp_path, published.extend)
-    folder.open("scan", RasterPlan(2, 2, 1.0, 1.0), 0)
+    folder.open("scan", PLAN, host_seq=0)
     end = NewEvent.now(m.RowFinished, **ROW_DONE)
     published.clear()
     monkeypatch.setattr(journal_module.os, "pwrite", refuse_to_write)
@@ -294,7 +311,7 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     host = host_in_row
     last_seq = host.list_events(m.Capture)[0].seq
     monkeypatch.setattr(journal_module.os, "pwrite", refuse_to_write)
-    # The row would be done before a slow disk says that it is full.
+    # The stage goes on, but not to the end of the row: a slow disk might report too late that it is full.
     stage.stays_after = 4
     fault = host.wait_for_event(m.Fault)
     row_finished = host.wait_for_event(m.RowFinished)

@@ -1,4 +1,7 @@
-"""Power is lost at each disk operation: everything synced is on the disk, and the disk has a prefix of the events."""
+"""Power is lost at each disk operation of a journal.
+
+Afterwards the journal has all events that were synced. What it has is the beginning of the sequence of events.
+"""
 
 import os
 from typing import Any
@@ -10,7 +13,7 @@ from polysight_pi.journal import Journal, NewEvent
 from polysight_shared import messages as m
 from polysight_shared.raster import RasterPlan
 
-PLAN = RasterPlan(3, 2, 1.0, 1.0)
+PLAN = RasterPlan(columns=3, rows=2, step_x_mm=1.0, step_y_mm=1.0)
 
 
 def make_events() -> list[tuple[type[m.AnyEvent], dict[str, Any]]]:
@@ -28,7 +31,8 @@ def make_events() -> list[tuple[type[m.AnyEvent], dict[str, Any]]]:
 
 
 def is_same_event(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, Any]]) -> bool:
-    return type(event) is other[0] and getattr(event, "point", 0) == other[1].get("point", 0)
+    other_type, other_fields = other
+    return type(event) is other_type and getattr(event, "point", 0) == other_fields.get("point", 0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -47,9 +51,9 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
         journal = Journal(path, lambda raws, out=published: out.extend(map(m.unpack_event, raws)))
         try:
             with FaultyDisk(path, "power cut", position, seed)():
-                journal.open("s", PLAN, 0)
-                for event in added:
-                    journal.write([NewEvent.now(event[0], **event[1])])
+                journal.open("s", PLAN, host_seq=0)
+                for event_type, fields in added:
+                    journal.write([NewEvent.now(event_type, **fields)])
                 journal.close()
             ended = True
         except Killed:
@@ -58,13 +62,15 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
             # The end of the process would release its lock of the folder.
             os.close(journal._lock)
         reopened = Journal(path)
-        reopened.open("s", PLAN, 0)
-        events_kept = [m.unpack_event(raw) for raw in reopened.read("s", 1, 1000)[0]]
+        reopened.open("s", PLAN, host_seq=0)
+        stored, _ = reopened.read("s", from_seq=1, limit=1000)
+        events_kept = [m.unpack_event(raw) for raw in stored]
         assert [e.seq for e in events_kept] == list(range(1, len(events_kept) + 1))
         assert all(map(is_same_event, events_kept, added)), "a prefix of what was added"
         synced = max((e.seq for e in published if not isinstance(e, m.Capture)), default=0)
         assert len(events_kept) >= synced, "what was published as synced is on the disk"
-        reopened.write([NewEvent.now(added[-1][0], **added[-1][1])])
+        last_type, last_fields = added[-1]
+        reopened.write([NewEvent.now(last_type, **last_fields)])
         assert reopened.last_seq == len(events_kept) + 1
         reopened.close()
     # There are more operations than events: the cuts did come in the middle.

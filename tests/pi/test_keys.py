@@ -3,6 +3,7 @@
 CURVE is ZeroMQ's encryption. Each end has a pair of keys: NAME.key is public, and NAME.key_secret has both.
 """
 
+import errno
 import shutil
 import threading
 from pathlib import Path
@@ -56,7 +57,8 @@ def served_pi(tmp_path):
     """A Pi's sockets on all addresses, with keys in `keys`; they serve until the test's end."""
     make_keys(tmp_path / "keys")
     make_keys(tmp_path / "other")
-    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 50)
+    every_address = "tcp://0.0.0.0:*"
+    server = Server(every_address, every_address, tmp_path / "keys", heartbeat_ms=50)
     thread = threading.Thread(target=server.run, args=(HelloExecutor(),))
     thread.start()
     yield server
@@ -80,10 +82,11 @@ def make_client(context):
     def make(kind, address, secret_of_host, public_of_pi):
         socket = context.socket(kind)
         socket.curve_publickey, socket.curve_secretkey = load_certificate(secret_of_host)
-        socket.curve_serverkey = load_certificate(public_of_pi)[0]
-        sockets.append((HandshakeMonitor(socket), socket))
+        socket.curve_serverkey, _ = load_certificate(public_of_pi)
+        refusals = HandshakeMonitor(socket)
+        sockets.append((refusals, socket))
         socket.connect(address.replace("0.0.0.0", "127.0.0.1"))
-        return socket, sockets[-1][0].is_refused
+        return socket, refusals.is_refused
 
     yield make
     for refusals, socket in sockets:
@@ -131,9 +134,10 @@ def test_a_revoked_client_is_disconnected_immediately_and_the_others_stay(tmp_pa
     }
 
     def ask(name):
-        clients[name][0].send(m.pack(m.Hello()))
-        assert clients[name][0].poll(HANG_S * 1e3)
-        return m.unpack_reply(clients[name][0].recv())
+        socket, _ = clients[name]
+        socket.send(m.pack(m.Hello()))
+        assert socket.poll(HANG_S * 1e3)
+        return m.unpack_reply(socket.recv())
 
     assert [type(ask(name)) for name in clients] == [m.HelloReply, m.HelloReply]
     revoke_client(keys, "laptop")
@@ -238,11 +242,11 @@ def test_keys_of_another_user_are_an_error_with_its_remedy(config, monkeypatch, 
 
     def refuse(path, **more):
         if path.name.endswith(".key_secret"):
-            raise PermissionError(13, "Permission denied", str(path))
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
         return stat(path, **more)
 
     monkeypatch.setattr(Path, "stat", refuse)
-    assert main(["keys", "--config", str(config)]) == 5
+    assert main(["keys", "--config", str(config)]) == DeviceError.exit_status
     messages = capsys.readouterr().err
     assert "Permission denied" in messages
     assert "sudo -u polysight" in messages

@@ -10,7 +10,7 @@ from polysight_shared import messages as m
 
 
 class Ended:
-    """Stands for the event that ends the watch, after so many waits."""
+    """Stands for the event that ends the watch: it is set after `waits` calls of `wait`."""
 
     def __init__(self, waits: int) -> None:
         self.left = waits
@@ -23,7 +23,10 @@ class Ended:
 
 
 class DrawnWatch(MemoryWatch):
-    """It uses `sizes` bytes at its checks, and the last size from then on; each cut finds two connections."""
+    """A watch of a program whose memory has the next of `sizes` at each check, and then keeps the last one.
+
+    Two connections are open whenever it cuts connections.
+    """
 
     def __init__(self, sizes: list[int], waits: int, at_start: int = 0) -> None:
         self.sizes = [at_start, *sizes]
@@ -33,7 +36,9 @@ class DrawnWatch(MemoryWatch):
         self._ended: Any = Ended(waits)
 
     def resident_bytes(self) -> int:
-        return self.sizes.pop(0) if len(self.sizes) > 1 else self.sizes[0]
+        if len(self.sizes) > 1:
+            return self.sizes.pop(0)
+        return self.sizes[0]
 
     def _cut_connections(self) -> int:
         self.cuts += 1
@@ -48,7 +53,8 @@ class DrawnWatch(MemoryWatch):
 def test_connections_are_cut_beyond_the_limit_alone(above_bytes, is_cut):
     watch = DrawnWatch([MAX_BYTES + above_bytes, 0], waits=2)
     watch.watch()
-    assert (watch.cuts > 0, bool(watch.said)) == (is_cut, is_cut)
+    assert (watch.cuts > 0) == is_cut
+    assert bool(watch.said) == is_cut
 
 
 @pytest.mark.parametrize(("above_bytes", "is_cut"), [(0, False), (1, True)])
@@ -74,7 +80,7 @@ def test_memory_that_stays_in_use_after_a_cut_raises_the_limit():
     watch = DrawnWatch([left_bytes, left_bytes, left_bytes + SPARE_BYTES, left_bytes + SPARE_BYTES + 1, 0], waits=24)
     watch.watch()
     assert len(watch.said) == 2
-    # The second time at the check that found more, not at the one that found as much.
+    # The second cut was at the check that found more than the new limit, not at the one that found just the limit.
     assert watch.said[1].endswith(", 0 MiB are left")
 
 

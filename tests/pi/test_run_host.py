@@ -29,7 +29,7 @@ from polysight_pi.service import TAKE_OVER_KEY
 from polysight_pi.trigger import TriggerLoop
 from polysight_shared import messages as m
 from polysight_shared.errors import ErrorCode
-from polysight_shared.faults import PiFault
+from polysight_shared.faults import PiFault, StageError
 from polysight_shared.raster import RasterPlan
 from polysight_shared.stage_line import Reply
 
@@ -85,7 +85,7 @@ class Bench:
     def begin_run(self, scan_id: str = "s", heartbeat_s: float = HEARTBEAT_S) -> Any:
         heartbeat_ms = round(heartbeat_s * 1e3)
         burst = {"pulses": 4, "period_us": 1500.0, "width_us": 1.0, "speed_mm_s": 20.0}
-        plan = RasterPlan(40, 2, 2.0, 2.0)
+        plan = RasterPlan(columns=40, rows=2, step_x_mm=2.0, step_y_mm=2.0)
         return self.ask(m.BeginRun(scan_id=scan_id, plan=plan, heartbeat_ms=heartbeat_ms, **burst))
 
     def make_ready(self) -> Bench:
@@ -122,7 +122,7 @@ def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
     assert (bench.state, bench.list_events(m.Fault)) == ("running", [])
     bench.t += LIMIT_S + 0.001
     bench.run_turn()
-    # From the beginning of the row on it is watched.
+    # From the beginning of the row on the host is watched.
     assert bench.list_events(m.Fault)[0].number == PiFault.HOST_LOST
 
 
@@ -152,10 +152,10 @@ def test_another_host_cannot_begin_a_run_while_the_first_one_lives(bench):
     refusal = bench.begin_run("other")
     assert refusal.number == PiFault.NOT_READY
     assert refusal.remedy
-    # Nothing has changed, and its own host may begin again.
+    # Nothing has changed, and the first host may begin its run again.
     assert (bench.state, bench.executor.status.scan_id) == ("ready", "s")
     assert isinstance(bench.begin_run("s"), m.Accepted)
-    # After its silence another one may.
+    # When the first host has been silent for long enough, another one may begin.
     bench.t += LIMIT_S
     assert isinstance(bench.begin_run("other"), m.Accepted)
 
@@ -164,7 +164,7 @@ def test_replays_have_few_events_while_a_row_runs_and_many_before_and_after(benc
     """A client that asks for one part after another gets all events. Other scans are replayed only between rows."""
     bench.make_ready()
     for _ in range(60):
-        # Each adds an event.
+        # Each request to begin the run adds an event to its journal.
         bench.begin_run()
     assert len(bench.ask(m.Replay(scan_id="s", from_seq=1)).events) == 61
     bench.run_row()
@@ -176,10 +176,10 @@ def test_replays_have_few_events_while_a_row_runs_and_many_before_and_after(benc
     refusal = bench.ask(m.Replay(scan_id="earlier", from_seq=1))
     assert refusal.number == PiFault.NOT_READY
 
-    # The row ends because its host is silent; alarm 15 is the stage's report that it was stopped.
+    # The row ends because its host is silent; the stage reports that it was stopped.
     bench.t += LIMIT_S
     bench.run_turn()
-    bench.run_turn(Reply("alarm", number=15))
+    bench.run_turn(Reply("alarm", number=StageError.STOPPED))
     bench.run_turn()
     assert bench.state == "ready"
     assert len(bench.ask(m.Replay(scan_id="s", from_seq=1)).events) > REPLAYED_IN_A_ROW
@@ -204,8 +204,12 @@ def hang(pi):
     is_hanging = threading.Event()
     released = threading.Event()
 
+    def report_and_hang():
+        is_hanging.set()
+        released.wait(HANG_S)
+
     def hang_executor():
-        pi.service.executor.post(lambda: (is_hanging.set(), released.wait(HANG_S)))
+        pi.service.executor.post(report_and_hang)
         assert is_hanging.wait(HANG_S)
         return released
 
@@ -232,9 +236,9 @@ def test_only_the_owner_commands_a_run(owner_in_row, stage):
 
 
 def test_a_command_for_an_earlier_take_of_a_row_does_not_move_the_stage(host, stage):
-    """Such a command is a late copy, or that of a faulty program: the numbers of a row's takes only increase.
+    """The numbers of a row's takes only increase: a command for an earlier take is a late copy, or an error.
 
-    The last command may be repeated, if its answer was lost; it acts once.
+    The last command may be repeated if its answer was lost, and acts once.
     """
     for row, take in ((1, 1), (2, 1), (1, 2), (1, 4)):
         assert host.run_row(row, take).status == "done"
@@ -252,7 +256,7 @@ def test_a_command_for_an_earlier_take_of_a_row_does_not_move_the_stage(host, st
 
 
 def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
-    """The journal has the earlier takes."""
+    """The Pi reads the earlier takes from the journal."""
     rig = set_stage_port(instrument, stage.port)
     for first_take in (1, 2):
         with closing(Running(rig, hub)) as running:

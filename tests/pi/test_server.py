@@ -13,7 +13,7 @@ from polysight_shared import messages as m
 from polysight_shared.errors import DeviceError
 from polysight_shared.faults import PiFault, StageError
 from polysight_shared.messages import is_simulated
-from polysight_shared.stage_line import Immediate
+from polysight_shared.stage_line import Immediate, Parameter
 from polysight_shared.wires import WireClient, WireEdge
 
 # The first row of the scan, for the first time.
@@ -75,13 +75,22 @@ def test_the_stage_gets_its_settings_and_the_row_in_motor_steps(instrument, stag
     half = 3.5 * 2 * 200
     y = 250 * 200 - 1.5 * 2 * 200
     assert row.args == (400 * 200 - half, 400, 8, y, 4000)
-    # Values of the stage's parameters by their number (docs/spec/stage-line.md).
-    sets = {c.args[0]: c.args[1] for c in stage.seen if c.verb == "SET"}
-    assert sets == {0: 40000, 1: 1000, 2: 20, 3: 160000, 4: 100000, 5: 8000, 6: 0, 7: 0}
+    # The units are those of docs/spec/stage-line.md: milliseconds, microseconds, and steps of 1/200 mm.
+    settings = {Parameter(c.args[0]): c.args[1] for c in stage.seen if c.verb == "SET"}
+    assert settings == {
+        Parameter.ACCEL: 200 * 200,
+        Parameter.HEARTBEAT: 1000,
+        Parameter.TRIGGER: 20,
+        Parameter.TRAVEL_X: 800 * 200,
+        Parameter.TRAVEL_Y: 500 * 200,
+        Parameter.TRAVEL_SPEED: 40 * 200,
+        Parameter.BACKLASH: 0,
+        Parameter.PINS: 0,
+    }
 
 
 def test_homing_reports_lost_steps(host, stage):
-    """Homing after a scan shows how far the switches are from where the stage counted them, in motor steps."""
+    """Homing after a scan measures how many motor steps were lost since the last homing."""
     status = host.ask(m.Status())
     assert (status.lost_x_mm, status.lost_y_mm) == (0, 0)
     stage.lost = (-7, 12)
@@ -185,7 +194,7 @@ def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
 
 
 def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
-    """With heartbeats the row runs longer than the timeout; without them it ends with fault 108."""
+    """With heartbeats the row runs longer than the timeout; without them it ends with the fault HOST_LOST."""
     host = pi.host
     host.must_accept(host.make_begin(heartbeat_ms=100))
     host.home()
@@ -252,7 +261,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
     host.start_row()
     stage.stays_after = None
     pi.thread.join(HANG_S)
-    # The first ends the executor's thread, the second the service, which watches it.
+    # The first exception ends the thread of the executor, the second one the service, which watches that thread.
     assert raised == [ZeroDivisionError, DeviceError]
     pi.service._loop.stop()
     assert not pi.service._loop._lines._active

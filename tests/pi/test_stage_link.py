@@ -21,8 +21,10 @@ from polysight_pi.cli import main
 from polysight_pi.stage import BenchStage, StageLink, StageLost, StageLostError, StageRefusedError
 from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import StageError, explain
-from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
+from polysight_shared.stage_line import Immediate, Parameter, Reply
 from polysight_simulators.builds import sketch_compiler
+
+BAUD_RATE = 115_200
 
 
 @pytest.fixture
@@ -40,7 +42,7 @@ def connect(dry_stage):
 
     def connect(**options):
         news = queue.SimpleQueue()
-        links.append(StageLink(dry_stage.port, 115200, news.put, **options))
+        links.append(StageLink(dry_stage.port, BAUD_RATE, news.put, **options))
         return links[-1], news
 
     yield connect
@@ -58,16 +60,16 @@ def test_a_stage_without_banner_is_greeted_after_the_limit(dry_stage, connect):
     """A stage whose port was already open does not restart, and so prints no banner."""
     dry_stage.banner = False
     link, _ = connect(banner_timeout_s=0.05)
-    assert link.request("SET", 1, 500).kind == "ok"
+    assert link.request("SET", Parameter.HEARTBEAT, 500).kind == "ok"
 
 
 def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage, connect):
     link, _ = connect()
     # The next line arrives damaged; then the answer to one is lost.
     dry_stage.damage = 1
-    link.request("SET", 1, 500)
+    link.request("SET", Parameter.HEARTBEAT, 500)
     dry_stage.lose = 1
-    link.request("SET", 2, 20)
+    link.request("SET", Parameter.TRIGGER, 20)
     assert [(c.sequence, c.verb) for c in dry_stage.seen] == [(0, "HELLO"), (1, "SET"), (2, "SET")]
 
 
@@ -89,7 +91,7 @@ def test_a_line_that_always_arrives_damaged_is_sent_four_times(dry_stage, connec
 
 def test_waiting_for_a_lost_answer_leaves_time_for_a_stop():
     """The thread that waits for an answer also sends the stops. A stop has to be sent within half a second."""
-    # One wait may take a third of that.
+    # Waiting once for an answer may take a third of that.
     assert stage.ANSWER_TIMEOUT_S <= 0.5 / 3
     # A busy machine has 2 s to answer.
     assert stage.ANSWER_TIMEOUT_S * stage.TRIES >= 2.0
@@ -107,19 +109,19 @@ def test_a_refusal_of_the_stage_has_its_number_explanation_and_remedy(connect):
 def test_numbers_of_lines_begin_again_after_65535(connect):
     link, _ = connect()
     link._sequence = 65535
-    assert link.request("SET", 1, 500).sequence == 65535
-    assert link.request("SET", 1, 500).sequence == 0
+    assert link.request("SET", Parameter.HEARTBEAT, 500).sequence == 65535
+    assert link.request("SET", Parameter.HEARTBEAT, 500).sequence == 0
 
 
 def test_answers_are_distinguished_from_spontaneous_lines(dry_stage, connect):
     link, news = connect()
     dry_stage.say_raw(b"\x00garbage\n" + b"x" * 500 + b"\n")
-    dry_stage.say(Reply("alarm", number=12))
-    link.request("SET", 1, 500)
+    dry_stage.say(Reply("alarm", number=StageError.LIMIT_SWITCH))
+    link.request("SET", Parameter.HEARTBEAT, 500)
     link.send_byte(Immediate.STATUS)
     kinds = [news.get(timeout=HANG_S).kind for _ in range(3)]
     assert sorted(kinds) == ["alarm", "ok", "status"]
-    # One with characters that do not belong to a line, and one that is too long.
+    # One line has characters that no line may have, and one line is too long.
     assert link.bad_lines == 2
 
 
@@ -127,13 +129,13 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
     link, news = connect(heartbeat_s=0.2)
     link.ask_status_every(0.02)
     assert news.get(timeout=HANG_S).kind == "status"
-    # From now on it answers nothing.
+    # From now on the stage answers nothing.
     dry_stage.deaf = True
     while not isinstance(stage_lost := news.get(timeout=HANG_S), StageLost):
         pass
     assert "silent" in stage_lost.reason
     with pytest.raises(StageLostError):
-        link.request("SET", 1, 500)
+        link.request("SET", Parameter.HEARTBEAT, 500)
 
 
 def test_a_moving_stage_that_receives_but_cannot_send_is_stopped(dry_stage, connect):
@@ -172,8 +174,8 @@ def test_a_sketch_that_does_not_know_the_newest_setting_is_named_as_old(
     monkeypatch.setattr(StageLink, "request", refuse_parameter)
     with pytest.raises(StageRefusedError) as e, BenchStage(set_stage_port(instrument, dry_stage.port).stage) as bench:
         bench.home()
-    is_old = e.value.remedy == "flash the sketch of this release"
-    assert is_old is (refused_parameter == Parameter.PINS)
+    is_named_as_old = e.value.remedy == "flash the sketch of this release"
+    assert is_named_as_old is (refused_parameter == Parameter.PINS)
 
 
 def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):
@@ -186,7 +188,7 @@ def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):
 
 def test_a_missing_port_and_another_version_of_the_protocol_are_refused(tmp_path, monkeypatch, connect):
     with expect_refusal(ErrorCode.FILE_UNREADABLE, tmp_path / "none"):
-        StageLink(str(tmp_path / "none"), 115200, lambda _: None)
+        StageLink(str(tmp_path / "none"), BAUD_RATE, lambda _: None)
     monkeypatch.setattr("polysight_pi.stage.PROTOCOL_VERSION", 9)
     with expect_refusal(ErrorCode.VERSION_UNSUPPORTED, "protocol 2", 9):
         connect()
@@ -202,16 +204,22 @@ def test_other_steps_per_mm_are_refused_before_a_motion(dry_stage, instrument):
 def test_jog_and_home_by_hand(dry_stage, instrument):
     with BenchStage(set_stage_port(instrument, dry_stage.port).stage) as stage:
         with pytest.raises(StageRefusedError):
-            stage.jog(1, 1, 20)
+            stage.jog(dx_mm=1, dy_mm=1, speed_mm_s=20)
         assert stage.home() == (0.0, 0.0)
-        assert stage.jog(10, 5.5, 20) == (10.0, 5.5)
-        assert stage.jog(-1, 0, 20) == (9.0, 5.5)
-    assert dry_stage.seen[-1] == Command(dry_stage.seen[-1].sequence, "MOVE", (1800, 1100, 4000))
+        assert stage.jog(dx_mm=10, dy_mm=5.5, speed_mm_s=20) == (10.0, 5.5)
+        assert stage.jog(dx_mm=-1, dy_mm=0, speed_mm_s=20) == (9.0, 5.5)
+    # x, y and rate, with 200 steps/mm.
+    last_command = dry_stage.seen[-1]
+    assert last_command.verb == "MOVE"
+    assert last_command.args == (9.0 * 200, 5.5 * 200, 20 * 200)
 
 
 @pytest.mark.slow
 def test_after_a_home_each_further_command_may_jog(write_config, instrument, tmp_path, capsys):
-    """Each command opens the port again, which resets the stage only if another program has closed it with DTR low."""
+    """Each command opens the port again.
+
+    That resets the stage only if another program has closed the port with its line DTR low.
+    """
     port = tmp_path / "ttySTAGE"
     # No service listens there, so that the command uses the stage itself.
     pi = msgspec.structs.replace(instrument.pi, command_address="tcp://127.0.0.1:9")

@@ -118,16 +118,17 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     wait_for(lambda: stop_is_sent(stage), "STOP")
     number = PiFault.PROGRAM_LATE if host_lives else PiFault.HOST_LOST
     assert host.wait_for_state("ready").fault == number
-    fed: list[bool] = []
-    monkeypatch.setattr(pi.service.executor, "_turned", lambda: fed.append(True))
+    # An entry for each time that the watchdog is notified.
+    notified: list[bool] = []
+    monkeypatch.setattr(pi.service.executor, "_turned", lambda: notified.append(True))
     wait_for(lambda: pi.service._find_late() != "", "that the journal is late")
-    fed.clear()
+    notified.clear()
     pi.clock.sleep(3 * executors.TURN_S)
     # The watchdog is notified only if every part of the program is in time.
-    assert not fed
+    assert not notified
     disk.thaw()
     assert host.wait_for_event(m.RowFinished).fault == number
-    wait_for(lambda: bool(fed), "that the watchdog is fed again")
+    wait_for(lambda: bool(notified), "that the watchdog is notified again")
 
 
 def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
@@ -135,7 +136,7 @@ def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
     settings = msgspec.structs.replace(instrument.pi, heartbeat_ms=3_600_000)
     rig = msgspec.structs.replace(instrument, pi=settings)
     with closing(Running(set_stage_port(rig, stage.port), hub)) as pi:
-        # Without a stage there are no statuses to send either
+        # Without a stage there are no statuses to send, either.
         stage.unplug()
         pi.host.wait_for_state("fault")
         pi.clock.sleep(LATE_S)
@@ -157,7 +158,7 @@ def test_after_a_pause_of_the_whole_program_the_fault_does_not_name_one_part_onl
 
 
 def test_a_command_of_a_run_is_accepted_only_when_its_event_is_on_the_disk(disk, pi):
-    """These commands are: begin a run, start a row, end the run. Other commands are answered meanwhile."""
+    """The commands are those that begin a run, start a row, or end the run. Others are answered meanwhile."""
     host = pi.host
     commands: list[Any] = [host.make_begin(), m.RunRow(scan_id="scan", row_index=0, take=1)]
     commands.append(m.EndRun(scan_id="scan", exit_status="success"))
@@ -209,7 +210,10 @@ def test_events_beyond_the_queue_of_a_hanging_disk_are_dropped_with_one_error(tm
 
 
 def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
-    """Another thread requests the status, which is no sign of life of the executor: this ends, and STOP is sent."""
+    """Another thread requests the stage's status, so that its requests do not show that the executor lives.
+
+    They end when the executor hangs, and STOP is sent.
+    """
     monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
     host = pi.host
     host.must_accept(host.make_begin())

@@ -1,7 +1,7 @@
 """When a stage counts as silent, and when the counts of a row agree, at each limit.
 
-A moving stage is asked for its status every 0.125 s here, a quarter of its heartbeat, and has 0.25 s to answer, half of
-it. At rest it is asked every second and has 3 s.
+A moving stage is asked for its status every 0.125 s here, a quarter of its heartbeat of 0.5 s, and has half of the
+heartbeat, 0.25 s, to answer. At rest it is asked every second and has 3 s.
 """
 
 from types import SimpleNamespace
@@ -17,11 +17,13 @@ from polysight_shared.raster import Row, Stage
 
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=-2.0, points=50)
 HEARTBEAT_S = 0.5
+# Time at which a watch begins.
+BEGIN_S = 100.0
 
 
 def make_watch(interval_s: float = 0.125) -> StatusWatch:
-    watch = StatusWatch(HEARTBEAT_S, 100.0)
-    watch.ask_every(interval_s, 100.0)
+    watch = StatusWatch(HEARTBEAT_S, BEGIN_S)
+    watch.ask_every(interval_s, BEGIN_S)
     return watch
 
 
@@ -36,15 +38,10 @@ def look(watch: StatusWatch, begin_s: float, end_s: float) -> float:
 
 def test_a_request_is_due_once_an_interval():
     watch = make_watch()
-    assert [watch.is_due(100 + at_s) for at_s in (0.124, 0.125, 0.126, 0.249, 0.25)] == [
-        False,
-        True,
-        False,
-        False,
-        True,
-    ]
+    for after_s, is_due in ((0.124, False), (0.125, True), (0.126, False), (0.249, False), (0.25, True)):
+        assert watch.is_due(BEGIN_S + after_s) == is_due, after_s
 
-    # 0: the status is not requested any more.
+    # An interval of 0 means that the status is not requested any more.
     watch.ask_every(0.0, 101.0)
     assert not watch.is_due(200.0)
     assert not watch.is_at_rest
@@ -75,7 +72,7 @@ def test_time_in_which_the_reader_itself_was_late_does_not_count():
     look(watch, 100.0, 100.1)
     assert watch.is_due(100.125)
     assert watch.silent_s(100.125) == 0.0
-    # It slept for ten seconds; twice its interval of 50 ms is usual.
+    # The reader slept for ten seconds. Usually it looks every 50 ms, and is late by no more than that.
     assert watch.silent_s(110.125) == 0.0
     # From then on the usual timeout counts, half of a heartbeat.
     timeout_s = 0.25
@@ -99,8 +96,8 @@ def make_row(**changes: Any) -> RunningRow:
     return RunningRow(**(fields | changes))
 
 
-# Edges, bursts and pulses of a complete row.
-COMPLETE = Counts(50, 50, 800)
+# A complete row has an edge and a burst at each of its 50 points.
+COMPLETE = Counts(edges=50, bursts=50, pulses=50 * 16)
 
 
 @pytest.mark.parametrize(
@@ -111,10 +108,10 @@ COMPLETE = Counts(50, 50, 800)
         ({"points": 51}, COMPLETE, "fault", PiFault.POINTS_MISMATCH),
         ({"triggers": 49}, COMPLETE, "fault", PiFault.POINTS_MISMATCH),
         ({"points": 51, "triggers": 51}, COMPLETE, "fault", PiFault.POINTS_MISMATCH),
-        ({}, Counts(49, 50, 800), "fault", PiFault.POINTS_MISMATCH),
-        ({}, Counts(50, 51, 800), "fault", PiFault.POINTS_MISMATCH),
-        ({}, Counts(50, 50, 799), "fault", PiFault.POINTS_MISMATCH),
-        ({}, Counts(50, 50, 801), "fault", PiFault.POINTS_MISMATCH),
+        ({}, COMPLETE._replace(edges=49), "fault", PiFault.POINTS_MISMATCH),
+        ({}, COMPLETE._replace(bursts=51), "fault", PiFault.POINTS_MISMATCH),
+        ({}, COMPLETE._replace(pulses=799), "fault", PiFault.POINTS_MISMATCH),
+        ({}, COMPLETE._replace(pulses=801), "fault", PiFault.POINTS_MISMATCH),
         ({"edges": SimpleNamespace(judge=lambda *_: "late")}, COMPLETE, "fault", PiFault.EDGE_TIME),
     ],
 )  # fmt: skip
@@ -132,6 +129,10 @@ def test_a_row_is_done_when_all_counts_are_those_requested(changes, counts, stat
 
 
 def test_a_row_is_expected_to_last_as_long_as_its_travel_points_and_ramps():
-    """The longest travel, one axis after the other; 50 points of 2 mm; two ramps of the travel and two of the row."""
+    """The travel is the longest one in both axes, one after the other. Travel and row have two ramps each."""
     stage = Stage("x", travel_x_mm=800.0, travel_y_mm=500.0, travel_speed_mm_s=40.0, accel_mm_s2=200.0)
-    assert estimate_row_duration_s(ROW, stage, 20.0) == pytest.approx(1300 / 40 + 50 * 2 / 20 + 4 * 20 / 200)
+    speed_mm_s = 20.0
+    travel_s = (800 + 500) / 40
+    points_s = 50 * 2 / speed_mm_s
+    ramp_s = speed_mm_s / 200
+    assert estimate_row_duration_s(ROW, stage, speed_mm_s) == pytest.approx(travel_s + points_s + 4 * ramp_s)

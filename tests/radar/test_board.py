@@ -2,6 +2,7 @@
 
 import struct
 
+import msgspec
 import pytest
 from tests.support.radar.boards import Restarts
 from tests.support.refusals import expect_refusal
@@ -249,8 +250,6 @@ def test_closing_stops_waiting_frames(radar, board, words):
 
 
 def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
-    import msgspec
-
     burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=5000.0)
     rig_of_many_chirps = msgspec.structs.replace(rig, burst=burst)
     program = make_program(rig_of_many_chirps, rig_of_many_chirps.by_name("LS"))

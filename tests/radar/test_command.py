@@ -48,7 +48,10 @@ def rig_file(rig, tmp_path):
 
 @pytest.fixture
 def opened_boards(words, clock, monkeypatch):
-    """The address of each board that the command has opened, and whether slowly: always the simulated board `RH`."""
+    """Each opening of a board by the command: its address, and True if slowly.
+
+    In place of any board the simulated board `RH` is opened.
+    """
     places = []
 
     def open_board(place, slow):
@@ -64,6 +67,35 @@ def run(path, *args: str) -> int:
     return main(["radar", "--config", str(path), *args])
 
 
+# Changes of a simulated board
+
+
+def leave_sound(_board):
+    pass
+
+
+def set_wrong_jumpers(board):
+    """The jumpers of a board select how it starts."""
+    board.functional_jumpers = False
+
+
+def switch_off(board):
+    board.switch_power(False)
+
+
+def erase_flash(board):
+    board.cores.flash = b""
+
+
+def damage_memory(board):
+    # Bit of the boot status: the memory was not initialised.
+    board.cores.hardware_bits = 1 << 55
+
+
+def unplug(board):
+    board.plugged = False
+
+
 def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
     assert run(rig_file(), "plan") == SUCCESS
     out = capsys.readouterr().out
@@ -73,8 +105,8 @@ def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
     expected = []
     for board in rig.boards:
         messages = make_program(rig, board)
-        # A row of the published rig: 350 positions of 16 pulses
-        commands = (*messages.basic, *messages.waveform, *messages.make_frame_commands(350 * 16))
+        frames_of_a_row = rig.grid.columns * rig.burst.pulses
+        commands = (*messages.basic, *messages.waveform, *messages.make_frame_commands(frames_of_a_row))
         expected += [(command.block(),) for command in commands]
     assert sent == expected
 
@@ -91,12 +123,11 @@ def test_a_sound_board_passes_every_step(rig_file, opened_boards, capsys):
 @pytest.mark.parametrize(
     ("spoil", "step", "text"),
     [
-        # The jumpers of a board select how it starts.
-        (lambda board: setattr(board, "functional_jumpers", False), "reset", ("SOP0 set", "[ o=o ]", "5 V")),
-        (lambda board: board.switch_power(False), "reset", ("no power",)),
-        (lambda board: setattr(board.cores, "flash", b""), "versions", ("no patch", "radar.firmware")),
-        (lambda board: setattr(board.cores, "hardware_bits", 1 << 55), "firmware", ("memory not initialised",)),
-        (lambda board: setattr(board, "plugged", False), "reset", ("unplugged",)),
+        (set_wrong_jumpers, "reset", ("SOP0 set", "[ o=o ]", "5 V")),
+        (switch_off, "reset", ("no power",)),
+        (erase_flash, "versions", ("no patch", "radar.firmware")),
+        (damage_memory, "firmware", ("memory not initialised",)),
+        (unplug, "reset", ("unplugged",)),
     ],
 )
 @pytest.mark.usefixtures("opened_boards")
@@ -170,15 +201,7 @@ def test_a_rig_without_native_boards_is_refused(rig, rig_file, capsys):
         assert "usb_serial" in capsys.readouterr().err
 
 
-# Changes of a board: none, firmware that is missing, and wrong jumpers.
-CHANGES = [
-    lambda board: setattr(board, "plugged", True),
-    lambda board: setattr(board.cores, "flash", b""),
-    lambda board: setattr(board, "functional_jumpers", False),
-]
-
-
-@pytest.mark.parametrize("change", CHANGES, ids=["sound", "flash empty", "jumpers"])
+@pytest.mark.parametrize("change", [leave_sound, erase_flash, set_wrong_jumpers])
 @pytest.mark.usefixtures("opened_boards")
 def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path, change):
     change(board)

@@ -9,22 +9,39 @@ from tests.support.refusals import expect_refusal
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import make_program
-from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, read_image, split_into_chunks
+from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_FLASH, TO_RAM, check_image, read_image, split_into_chunks
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 RIG = make_native_rig()
 # Numbers of messages
-FIRMWARE_PART = 0x4080
+CHANNELS = 0x0080
+RF_VERSION = 0x0220
 RF_POWER_UP = 0x4000
+FIRMWARE_PART = 0x4080
+MAIN_VERSION = 0x40E0
+DEVICE_CONFIGURATION = 0x404C
 # An image of firmware in TI's format, 7940 bytes (docs/spec/mmwavelink.md), and one for the ROM of an AWR1243.
 DATA = make_image()
 IMAGE = check_image(DATA, "image.bin")
 FIRST_GENERATION = make_image(rom=bytes((1, 2, 5, 0, 18, 1, 1)))
 
 
-def append_crc(data: bytes) -> bytes:
-    return data + zlib.crc32(data).to_bytes(4, "little")
+# Bytes of the CRC-32 at the end of an image
+CRC_BYTES = 4
+# Offsets in the image of the word that closes its header, and of its two program parts. In a part the version of the
+# ROM and that of the patch are at 0x38 and 0x48.
+HEADER_END_AT = 0x5C
+MAIN_PART_AT = 0x80
+RF_PART_AT = 0x880
+ROM_VERSION_AT = 0x38
+PATCH_VERSION_AT = 0x48
+
+
+def overwrite_image(offset: int, new_bytes: bytes) -> bytes:
+    """Return the image with other bytes at this offset, and with the right checksum."""
+    content = DATA[:offset] + new_bytes + DATA[offset + len(new_bytes) : -CRC_BYTES]
+    return content + zlib.crc32(content).to_bytes(CRC_BYTES, "little")
 
 
 @pytest.mark.parametrize(
@@ -36,15 +53,17 @@ def append_crc(data: bytes) -> bytes:
         (b"MSTR", "4 bytes"),
         (DATA[: len(DATA) // 2], "7940"),
         (DATA + b"\0", "7940"),
-        (DATA[:-4], "CRC"),
+        (DATA[:-CRC_BYTES], "CRC"),
+        # One bit of the byte at 5000 is flipped.
         (DATA[:5000] + bytes((DATA[5000] ^ 4,)) + DATA[5001:], "CRC-32"),
-        # Right checksums, but headers of parts that are missing, of another kind, or for another chip.
-        (append_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
-        (append_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
+        # Right checksums, but headers of parts that are missing, of another kind, or for another chip. The right words
+        # are MEND at the end of the header and RPRC at the begin of a part.
+        (overwrite_image(HEADER_END_AT, b"ENDE"), "no program part"),
+        (overwrite_image(MAIN_PART_AT, b"CPRR"), "no program part"),
         (FIRST_GENERATION, "AWR1243"),
-        (append_crc(DATA[:0x8B8] + bytes((6, 2, 0, 13)) + DATA[0x8BC:-4]), "generation 6"),
-        (append_crc(DATA[:0x880] + b"CPRR" + DATA[0x884:-4]), "1 program parts"),
-        (append_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
+        (overwrite_image(RF_PART_AT + ROM_VERSION_AT, bytes((6, 2, 0, 13))), "generation 6"),
+        (overwrite_image(RF_PART_AT, b"CPRR"), "1 program parts"),
+        (overwrite_image(RF_PART_AT + PATCH_VERSION_AT, bytes((6, 4, 1, 13))), "its patches are 6.4.1.13"),
     ],
 )
 def test_a_file_that_is_not_an_image_is_refused_with_the_reason(data, why):
@@ -79,7 +98,8 @@ def test_the_parts_of_an_image_are_the_whole_image(size):
     image = bytes(n % 251 for n in range(size))
     parts = split_into_chunks(image)
     joined = b"".join(chunk.part for chunk, _ in parts)
-    assert joined == bytes((4, 0, 0, 0)) + size.to_bytes(4, "little") + image
+    # The image follows two words: its type, by which the ROM writes it into the flash, and its length.
+    assert joined == TO_FLASH.to_bytes(4, "little") + size.to_bytes(4, "little") + image
     # A message has at most 256 bytes: sync word, header, CRC and the header of the part take 24 of them.
     assert all(len(chunk.part) <= 256 - 24 for chunk, _ in parts)
     assert [remaining for _, remaining in parts] == list(reversed(range(len(parts))))
@@ -192,8 +212,8 @@ def test_a_board_whose_die_id_is_that_of_another_board_is_not_configured(clock, 
     )
     with expect_refusal(ErrorCode.MISMATCH, "5eed0001", "5eed0002"):
         use(radar)
-    # No channel was switched on (message 0x0080).
-    assert 0x0080 not in board.executed
+    # No channel was switched on.
+    assert CHANNELS not in board.executed
 
 
 # 27 self-tests, a bit for each that passed.
@@ -241,7 +261,7 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
         make_board(board, clock, image).configure()
     # Only these messages may have been sent: configuration of the device, power-up of the RF core, and the questions
     # for the versions.
-    assert set(board.executed) <= {0x404C, RF_POWER_UP, 0x0220, 0x40E0}
+    assert set(board.executed) <= {DEVICE_CONFIGURATION, RF_POWER_UP, RF_VERSION, MAIN_VERSION}
 
 
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["from RAM", "from flash"])
@@ -253,7 +273,7 @@ def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
 
     def answer_with_old_version(number, data):
         answer = execute(number, data)
-        if number == 0x0220:
+        if number == RF_VERSION:
             return answer[:10] + old_version
         return answer
 
@@ -341,7 +361,9 @@ def test_another_patch_than_that_of_the_image_is_a_warning_and_none_is_an_error(
 
     def answer(number, data):
         result = execute(number, data)
-        if number == 0x40E0 and any(result[10:]):
+        # Without a patch these bytes of the answer are zero, as before the download.
+        has_patch = any(result[10:])
+        if number == MAIN_VERSION and has_patch:
             return result[:10] + bytes(reported)
         return result
 

@@ -18,15 +18,21 @@ LARGEST_BODY = 256 - 20
 
 
 def make_command(*sizes: int, **values: int) -> m.Message:
-    """Return a command of sub-blocks with so many bytes of data each; `values` replace fields of its header."""
+    """Return a command with a sub-block of each size in bytes of data; `values` replace fields of its header."""
     blocks = tuple(m.SubBlock(0x4000, bytes(range(1, size + 1))) for size in sizes)
     return replace(m.command(blocks), **values)
 
 
 def build_device_message(body: bytes, block_count: int) -> bytes:
-    """Return an event of the RF core with this body, in all else valid, and a CRC of 16 bits."""
-    opcode = m.Direction.RF_TO_HOST | m.Kind.EVENT << 4 | 0x80 << 6
-    head = struct.pack("<5H", opcode, 12 + len(body) + 2, 0, 0, block_count)
+    """Return an event of the RF core with this body, which is valid in all else, and has a CRC of 16 bits."""
+    message_id = 0x80
+    opcode = m.Direction.RF_TO_HOST | m.Kind.EVENT << 4 | message_id << 6
+    header_bytes = 12
+    crc_bytes = 2
+    flags = 0
+    remaining_chunks = 0
+    length = header_bytes + len(body) + crc_bytes
+    head = struct.pack("<5H", opcode, length, flags, remaining_chunks, block_count)
     head += m.checksum(head).to_bytes(2, "little")
     return bytes.fromhex("badccdab") + head + body + binascii.crc_hqx(head + body, 0xFFFF).to_bytes(2, "little")
 

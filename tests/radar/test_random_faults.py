@@ -116,7 +116,10 @@ def _make_noise_case(rng: random.Random) -> Case:
             return word ^ 1 << draws.randrange(16)
         return word
 
-    return Case("noise from here on", NOISE + "|MISO", lambda words: setattr(words, "flip", flip_sometimes))
+    def act(words: FaultyWords) -> None:
+        words.flip = flip_sometimes
+
+    return Case("noise from here on", NOISE + "|MISO", act)
 
 
 def _make_event_case(rng: random.Random) -> Case:
@@ -148,52 +151,106 @@ def _flood(rng: random.Random) -> Case:
     return Case("events without a pause", r"without a pause|did not report|no valid answer", act)
 
 
+def unplug(words: FaultyWords) -> None:
+    words.board.plugged = False
+
+
+def cut_power(words: FaultyWords) -> None:
+    words.board.switch_power(False)
+
+
+def interrupt_power(words: FaultyWords) -> None:
+    words.board.switch_power(False)
+    words.board.switch_power(True)
+
+
+def hang(words: FaultyWords) -> None:
+    words.board.cores.destroyed = True
+
+
+def hold_interrupt_low(words: FaultyWords) -> None:
+    words.stuck = False
+
+
+def hold_interrupt_high(words: FaultyWords) -> None:
+    words.stuck = True
+
+
+def inject(*faults: Fault) -> Callable[[FaultyWords], None]:
+    """Return an action after which the board's next answers have these faults, one each."""
+
+    def act(words: FaultyWords) -> None:
+        words.board.inject(*faults)
+
+    return act
+
+
+def _make_dead_line_case(rng: random.Random) -> Case:
+    word = rng.choice((0xFFFF, 0))
+
+    def act(words: FaultyWords) -> None:
+        words.dead = word
+
+    return Case("MISO open", "MISO", act)
+
+
+# All faults but refusals
+DISTURBING = [fault for fault in Fault if fault not in (Fault.REFUSE, Fault.REFUSE_BARE)]
+
+
+def _make_single_fault_case(rng: random.Random) -> Case:
+    fault = rng.choice(DISTURBING)
+    return Case(fault.name, NOISE + "|" + SILENT, inject(fault))
+
+
+def _make_lasting_fault_case(rng: random.Random) -> Case:
+    fault = rng.choice([fault for fault in DISTURBING if fault is not Fault.EVENT_BETWEEN])
+    # More faults than a command has attempts
+    return Case(f"{fault.name} always", NOISE + "|" + SILENT, inject(*[fault] * 99))
+
+
+def _make_case_of_new_board(name: str, cause: str, act: Callable[[FaultyWords], None]) -> Case:
+    """Return the case of a board whose flash is empty, so that its firmware is loaded into its RAM."""
+    return Case(f"new board, {name}", cause, act, flash=b"", firmware=IMAGE)
+
+
+def _flip_once_on_new_board(rng: random.Random) -> Case:
+    flip = _flip_once(rng)
+    return _make_case_of_new_board(flip.name, flip.cause, flip.act)
+
+
 def draw(rng: random.Random) -> tuple[Case, int]:
     """Draw a fault and the transfer at which it happens."""
     # From the first transfer to the 5000th, uniform in its logarithm: early faults are as frequent as late ones.
     transfer = round(10 ** rng.uniform(0.0, 3.7))
-    once = [f for f in Fault if f is not Fault.REFUSE and f is not Fault.REFUSE_BARE]
     cases = {
         "flip": lambda: _flip_once(rng),
         "noise": lambda: _make_noise_case(rng),
         "event": lambda: _make_event_case(rng),
         "flood": lambda: _flood(rng),
-        "unplug": lambda: Case("unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False)),
-        "power": lambda: Case("power lost", SILENT, lambda w: w.board.switch_power(False)),
-        "brown-out": lambda: Case(
-            "brown-out", "restarted", lambda w: (w.board.switch_power(False), w.board.switch_power(True))
-        ),
-        "ram brown-out": lambda: Case(
-            "new board, brown-out",
-            "restarted",
-            lambda w: (w.board.switch_power(False), w.board.switch_power(True)),
-            b"",
-            IMAGE,
-        ),
-        "low": lambda: Case("interrupt stuck low", "interrupt line", lambda w: setattr(w, "stuck", False)),
-        "high": lambda: Case(
-            "interrupt stuck high", "interrupt.*(stays high|stuck)|MISO", lambda w: setattr(w, "stuck", True)
-        ),
-        "dead": lambda: Case("MISO open", "MISO", lambda w: setattr(w, "dead", rng.choice((0xFFFF, 0)))),
-        "hang": lambda: Case("hangs", "hangs", lambda w: setattr(w.board.cores, "destroyed", True)),
-        "refuse": lambda: Case("refuses", "refuses", lambda w: w.board.inject(Fault.REFUSE)),
-        "bare": lambda: Case("refuses, bare", "refuses", lambda w: w.board.inject(Fault.REFUSE_BARE)),
-        "once": lambda: (lambda f: Case(f.name, NOISE + "|" + SILENT, lambda w: w.board.inject(f)))(rng.choice(once)),
-        "lasting": lambda: (
-            lambda f: Case(f"{f.name} always", NOISE + "|" + SILENT, lambda w: w.board.inject(*[f] * 99))
-        )(rng.choice([f for f in once if f is not Fault.EVENT_BETWEEN])),
+        "unplug": lambda: Case("unplugged", "unplugged", unplug),
+        "power": lambda: Case("power lost", SILENT, cut_power),
+        "brown-out": lambda: Case("brown-out", "restarted", interrupt_power),
+        "ram brown-out": lambda: _make_case_of_new_board("brown-out", "restarted", interrupt_power),
+        "low": lambda: Case("interrupt stuck low", "interrupt line", hold_interrupt_low),
+        "high": lambda: Case("interrupt stuck high", "interrupt.*(stays high|stuck)|MISO", hold_interrupt_high),
+        "dead": lambda: _make_dead_line_case(rng),
+        "hang": lambda: Case("hangs", "hangs", hang),
+        "refuse": lambda: Case("refuses", "refuses", inject(Fault.REFUSE)),
+        "bare": lambda: Case("refuses, bare", "refuses", inject(Fault.REFUSE_BARE)),
+        "once": lambda: _make_single_fault_case(rng),
+        "lasting": lambda: _make_lasting_fault_case(rng),
         "empty": lambda: Case("flash empty", "no patch", flash=b""),
         "broken": lambda: Case("flash broken", "no patch", flash=IMAGE.data[: rng.randrange(4, len(IMAGE.data))]),
         "swapped": lambda: Case("another board", "die id", die_id="5eed0002-00000d1e-000008c3-00000002"),
         "jumpers": lambda: Case("jumpers for mmWave Studio", "SOP0 set", jumpers=False),
         "off": lambda: Case("no supply", "no power", supply=False),
         "ram": lambda: Case("new board", "-", flash=b"", firmware=IMAGE),
-        "ram flip": lambda: (lambda c: Case("new board, " + c.name, c.cause, c.act, b"", IMAGE))(_flip_once(rng)),
-        "ram unplug": lambda: Case(
-            "new board, unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False), b"", IMAGE
-        ),
+        "ram flip": lambda: _flip_once_on_new_board(rng),
+        "ram unplug": lambda: _make_case_of_new_board("unplugged", "unplugged", unplug),
     }
-    return cases[rng.choice(list(cases))](), transfer
+    make_case = cases[rng.choice(list(cases))]
+    return make_case(), transfer
 
 
 @dataclass

@@ -139,8 +139,17 @@ def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
     assert len([w for w in device.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
 
-@pytest.mark.parametrize(("direction", "kind"), [(2, 1), (5, 1), (1, 1), (6, 0)])
-def test_a_response_of_another_core_or_an_event_is_not_an_answer(direction, kind):
+@pytest.mark.parametrize(
+    ("direction", "kind"),
+    [
+        (m.Direction.RF_TO_HOST, m.Kind.RESPONSE),
+        (m.Direction.HOST_TO_MAIN, m.Kind.RESPONSE),
+        (m.Direction.HOST_TO_RF, m.Kind.RESPONSE),
+        (m.Direction.MAIN_TO_HOST, m.Kind.COMMAND),
+    ],
+)
+def test_only_a_response_of_the_core_that_got_the_command_is_an_answer(direction, kind):
+    """The command is for the main core."""
     message = encode_message(direction=direction, kind=kind, number=0x202, body=b"", count=0, sequence=0, wide=True)
     # One for each attempt of the host
     line, _ = connect(message, message, message)
@@ -164,8 +173,8 @@ def encode_chunk(remaining: int, block: int, data: bytes) -> bytes:
     """One of an answer's chunks, from the simulated device's encoder."""
     raw = bytearray(
         encode_message(
-            direction=6,
-            kind=1,
+            direction=m.Direction.MAIN_TO_HOST,
+            kind=m.Kind.RESPONSE,
             number=0x207,
             body=struct.pack("<2H", block, len(data) + 4) + data,
             count=1,
@@ -173,6 +182,8 @@ def encode_chunk(remaining: int, block: int, data: bytes) -> bytes:
             wide=True,
         )
     )
+    # Bytes 0 to 3 are the sync word, 10 and 11 the number of remaining chunks, 14 and 15 the checksum of the header.
+    # The last four bytes are the CRC.
     raw[10:12] = remaining.to_bytes(2, "little")
     raw[14:16] = b"\0\0"
     raw[14:16] = (0xFFFF - compute_ones_sum(bytes(raw[4:14]))).to_bytes(2, "little")

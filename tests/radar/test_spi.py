@@ -1,5 +1,7 @@
 """Each command of the SPI link is executed once and answered, although messages are lost, damaged or overtaken."""
 
+import itertools
+
 import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.radar.boards import BoardWords, VirtualClock, make_native_rig
@@ -176,8 +178,14 @@ HARMLESS = st.sampled_from([Fault.EVENT_BETWEEN, Fault.BAD_SYNC])
 
 
 def _draw_faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
-    lost_words = st.lists(LOST, max_size=2)
-    return st.one_of(lost_words, st.tuples(lost_words, HARMLESS).map(lambda t: [*t[0], t[1]]))
+    """Up to two faults by which a message is lost, and perhaps a harmless one after them."""
+
+    def append_last(parts: tuple[list[Fault], Fault]) -> list[Fault]:
+        lost, harmless = parts
+        return [*lost, harmless]
+
+    lost_messages = st.lists(LOST, max_size=2)
+    return st.one_of(lost_messages, st.tuples(lost_messages, HARMLESS).map(append_last))
 
 
 @settings(deadline=None)
@@ -194,8 +202,8 @@ def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_o
     board.executed.clear()
     link: Link = radar.link
     expected = []
-    for n, faults in enumerate(faults_of_each):
-        command = (LOW_POWER_OFF, LdoBypass(), Chirp(0))[n % 3]
+    commands = itertools.cycle((LOW_POWER_OFF, LdoBypass(), Chirp(0)))
+    for faults, command in zip(faults_of_each, commands, strict=False):
         board.inject(*faults)
         link.call(command)
         expected.append(command.ID)

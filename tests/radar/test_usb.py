@@ -48,7 +48,8 @@ def test_opening_a_chip_sets_the_mode_of_its_four_channels(plugged_chip):
     assert set(plugged_chip.latency_ms.values()) == {1}
     assert not words.interrupt()
     words.close()
-    assert plugged_chip.errors == plugged_chip.chip.errors == []
+    assert plugged_chip.errors == []
+    assert plugged_chip.chip.errors == []
 
 
 # Bytes of a USB packet: 510 is the most that the chip sends in one.
@@ -98,7 +99,8 @@ def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, p
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "1-4.2, 1-4.3") as caught:
         open_usb("FT1234")
     assert "usb_path" in caught.value.remedy
-    assert plugged_chip.modes == second_chip.modes == {}
+    assert plugged_chip.modes == {}
+    assert second_chip.modes == {}
 
 
 @pytest.mark.parametrize(

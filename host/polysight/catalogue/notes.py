@@ -18,11 +18,13 @@ from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 from polysight_shared.files import hold_folder, write_atomically
 
 NOTES_FILE = "operator.json"
-# Characters of the notes and of a tag, and tags of a scan: more would make the list of scans unreadable; chosen.
+# Largest numbers of characters of the notes and of a tag, and of tags of a scan; chosen. More would make the list of
+# scans unreadable.
 MAX_NOTES = 10_000
 MAX_TAG = 40
 MAX_TAGS = 20
-# The longest allowed notes and tags take 44 kB in UTF-8; a larger file was not written here, and is ignored.
+# The longest allowed notes and tags take 44 kB in UTF-8. A file that is larger than this was not written by
+# `write_notes`, and is ignored.
 MAX_NOTES_BYTES = 1 << 17
 
 
@@ -34,7 +36,7 @@ class Notes(msgspec.Struct, frozen=True):
 
 
 def read_notes(folder: Path) -> Notes:
-    """Read the notes of a scan; empty if there are none, or the file is too large to have been written here.
+    """Read the notes of a scan; empty if there are none, or the file is larger than `write_notes` writes any.
 
     Raises
     ------
@@ -67,7 +69,7 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
     ConfigError
         if a text is too long, or there are too many tags.
     ScanError
-        if the present notes differ from `base`, from which these were edited; None: not checked.
+        if the present notes differ from `base`, the notes that the user edited; with None this is not checked.
     DataError
         if the present notes are damaged, and `base` is given.
     """
@@ -87,7 +89,9 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
 
 
 def change_notes(folder: Path, change: Callable[[Notes], Notes]) -> Notes:
-    """Replace the notes of a scan by `change` of them, while no other program can; return them as written.
+    """Apply `change` to the notes of a scan and write the result; return the notes as written.
+
+    Meanwhile the folder is locked, so that no other program changes the notes.
 
     Raises
     ------
@@ -101,7 +105,7 @@ def change_notes(folder: Path, change: Callable[[Notes], Notes]) -> Notes:
 
 
 def _write_checked(folder: Path, notes: Notes) -> Notes:
-    """Check and write the notes of a folder that is held; return them as written. Raises ConfigError."""
+    """Check and write the notes of a locked folder; return them as written. Raises ConfigError."""
     text = remove_unprintable(notes.notes, keep="\n")
     # A dictionary drops tags that are given twice, and keeps the order.
     tags = dict.fromkeys(remove_unprintable(tag).strip() for tag in notes.tags)

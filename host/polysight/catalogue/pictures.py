@@ -6,6 +6,7 @@ Row 0 of an image (the smallest y) is at the bottom of its picture; unknown pixe
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, Self
@@ -109,7 +110,7 @@ class Picture:
 
 
 class Map(msgspec.Struct, frozen=True):
-    """A picture of a processed scan; some need a reference of metal."""
+    """A picture of a processed scan; with `needs_metal` it exists only for images relative to metal."""
 
     name: str
     title: str
@@ -171,10 +172,10 @@ def draw_products(pixels: Pixels, name: str, limits: products.Limits | None = No
 
 def thumbnail(pixels: Pixels) -> Picture:
     """Return a small picture of the amplitude of H."""
-    step = max(1, -(-max(pixels.h.shape) // THUMBNAIL_PIXELS))
+    # Take one pixel out of `step` along each axis.
+    step = max(1, math.ceil(max(pixels.h.shape) / THUMBNAIL_PIXELS))
     values = products.map_scan(pixels, "h", "amplitude")
-    small = (slice(None, None, step), slice(None, None, step))
-    smaller = replace(values, numbers=values.numbers[small], opacity=values.opacity[small])
+    smaller = replace(values, numbers=values.numbers[::step, ::step], opacity=values.opacity[::step, ::step])
     return draw_values(smaller, UNITS["amplitude"])
 
 
@@ -192,7 +193,8 @@ def _derive_values(pixels: Pixels, name: str) -> products.MapValues:
         eps = pixels.permittivity
         values = eps.value.real if name == "permittivity" else -eps.value.imag
         is_visible = eps.mask
-    # Edges of plates have any value: the colours end at 1.3 times the 85th percentile (chosen).
+    # At the edges of plates the values are arbitrary and may be very large: the colours end at 1.3 times the 85th
+    # percentile (chosen).
     high = products.percentile(values, is_visible, 85, 1.0)
     low = 1.0 if name == "permittivity" else 0.0
     return products.MapValues(values, is_visible, (low, max(1.3 * high, low + 1e-3)))

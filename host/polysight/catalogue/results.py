@@ -1,4 +1,8 @@
-"""Results of a processed scan: all of them for a page, those at one place, and the comparison of two scans."""
+"""Results of processed scans for pages and commands.
+
+`read_result` collects all results of a scan, `probe` those at one place of its image, and `compare` the differences
+between two scans.
+"""
 
 from __future__ import annotations
 
@@ -37,30 +41,31 @@ from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 Real = NDArray[np.float64]
 EXPORT_FOLDER = "export"
-"""Folder of a scan that a page has exports written into."""
+"""Folder, inside that of a scan, for the exports that were requested on a page."""
 FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES_FILE, SURFACE, POINTS)
 EXPORTS = (".mat", ".csv", ".nc")
-# Materials of the library that a probe lists; chosen.
+# Number of materials of the library that a probe lists; chosen.
 MAX_NEAREST = 5
 # Reach of the range profile to either side of the place; chosen.
 PROFILE_REACH_M = 0.3
-# Number of its points; chosen.
+# Number of points of the range profile; chosen.
 PROFILE_POINTS = 121
-# Lowest level that it shows, relative to the highest; chosen.
+# Lowest level of the range profile, relative to its highest; chosen.
 PROFILE_FLOOR_DB = -50.0
-# Smallest spread of a material's ratio between its patches, each part; chosen, since a material of one patch has none.
+# Smallest standard deviation of a material's V / H between its patches, in each part. Chosen: a material with a single
+# patch shows no deviation.
 LEAST_SPREAD = 5e-3
 # Colour map of matplotlib for differences: white at zero.
 DIFFERENCE_COLOURS = "RdBu"
 SIGNIFICANT_STDS = 3.0
 """Standard deviations above which a difference is significant."""
-# Smallest scatter of two scans in their stated errors: a copy has none at all; chosen.
+# Smallest result of `measure_scatter`; chosen. Between a scan and a copy of it the scatter would be 0.
 LEAST_SCATTER = 0.1
-# Largest distance of the centres of one patch in both scans; chosen, below the distance of neighbouring plates.
+# Largest distance of the centres of one patch in two scans; chosen, smaller than the distance of neighbouring plates.
 NEAR_MM = 15.0
 
 
-# --- all of it ---
+# --- all results of a scan ---
 
 
 class DrawnLabels(msgspec.Struct, frozen=True):
@@ -153,14 +158,22 @@ def list_files(folder: Path) -> list[File]:
 
 
 class FocusedProfile(msgspec.Struct, frozen=True):
-    """Level by board (dB relative to the highest) against the path beyond the place."""
+    """Range profile with all positions focused on a place.
+
+    `path_m` are paths minus the path of an echo from the place; `boards` has the level of each board at these paths, dB
+    relative to the highest level of all boards.
+    """
 
     path_m: list[float]
     boards: dict[str, list[float]]
 
 
 class NearMaterial(msgspec.Struct, frozen=True):
-    """A material of the library, with the distance of its ratio and its permittivity as a half space."""
+    """A material of the library.
+
+    `sigmas` is the distance of its V / H from that of the pixel, in standard deviations; `permittivity` is that of a
+    half space with the material's V / H.
+    """
 
     name: str
     sigmas: float | None
@@ -173,19 +186,20 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     place_mm
-        The pixel's, from the middle of the image.
+        Centre of the pixel, from the middle of the image.
     lit
         True if the scan illuminates it.
     h_db, v_db, p, p_sigma
         Levels of H and V, their ratio, and its standard deviation; relative to metal where `referenced`.
     permittivity, permittivity_real_std, permittivity_loss_std
-        As a half space, as in the map of permittivities; `why` it is unknown.
+        Permittivity of a half space and its standard deviations, as in the map of permittivities. If it is unknown,
+        `why` gives the reason.
     patch
         The patch whose outline holds the place.
     nearest
-        Materials by the distance of their ratio.
+        The nearest materials of the library, by the distance of their V / H.
     profile
-        Focused range profile through the place; `profile_why` there is none.
+        Range profile focused on the place. If there is none, `profile_why` gives the reason.
     """
 
     place_mm: tuple[float, float]
@@ -260,17 +274,23 @@ def _explain_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
 
 
 def _find_patch(patches: list[PatchFigures], place_mm: tuple[float, float]) -> PatchFigures | None:
-    """Return the patch whose outline holds a place; None if no one does."""
+    """Return the patch whose outline encloses a place; None if there is none."""
     for patch in patches:
         outline = patch.outline_mm
-        if len(outline) > 2 and skimage.measure.points_in_poly([place_mm], outline)[0]:
+        if len(outline) < 3:
+            continue
+        is_inside = skimage.measure.points_in_poly([place_mm], outline)
+        if is_inside.all():
             return patch
     return None
 
 
 @lru_cache(maxsize=4)
 def _average_library(path: Path, changed_ns: int, angle_deg: float) -> dict[str, tuple[complex, float]]:
-    """Mean of V / H and spread of its patches (of each part), by material. A file that has changed is read again."""
+    """Return material to the mean V / H of its patches in the library, and to their standard deviation in each part.
+
+    `changed_ns` is a part of the cache's key: a file that has changed is read again.
+    """
     del changed_ns
     patches: dict[str, list[complex]] = {}
     for entry in Library.load(path).at_angle(angle_deg).entries:
@@ -287,7 +307,10 @@ def _average_library(path: Path, changed_ns: int, angle_deg: float) -> dict[str,
 
 
 def _rank_materials(pixels: Pixels, row: int, column: int, library: Path | None) -> list[NearMaterial]:
-    """Return the library's materials by the distance of their ratio, in standard deviations of pixel and material."""
+    """Return the library's materials that are nearest to a pixel, by the distance of V / H in standard deviations.
+
+    The standard deviations are those of the pixel and of the material together.
+    """
     path = library or SIMULATED_LIBRARY
     try:
         ratios = _average_library(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
@@ -323,7 +346,7 @@ def _sort_by_sigmas(material: NearMaterial) -> float:
 
 
 def _focus_profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | None, str]:
-    """Return the focused range profile through a place, from the scan's kept samples; or None, and why."""
+    """Return the range profile focused on a place, from the scan's kept samples; or None and the reason."""
     scan = find_scan_folder(folder)
     if scan is None or not (scan / MANIFEST).exists():
         return None, "the rows are not in this folder"
@@ -384,7 +407,7 @@ def _split_parts(value: complex) -> ComplexNumber:
 
 
 class PermittivityDifference(msgspec.Struct, frozen=True):
-    """First minus second, with standard errors where both are known."""
+    """Permittivity of the first patch minus that of the second, with standard errors if those of both are known."""
 
     real: float
     imag: float
@@ -415,7 +438,8 @@ class ComparisonFigures(msgspec.Struct, frozen=True, kw_only=True):
     compared, significant_share
         Number of pixels, and the share of them that differs by more than `significant_sigmas`; None: not known.
     scatter
-        Scatter of unchanged pixels in stated errors, :func:`measure_scatter`; None if the errors are not known.
+        Scatter of unchanged pixels relative to their stated errors, see :func:`measure_scatter`; None if the errors are
+        not known.
     """
 
     patches: list[PatchPair]
@@ -453,7 +477,7 @@ def compare(first: Path, second: Path) -> Comparison:
 
 
 def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
-    """Compare two processed scans, pixel by pixel and patch by patch; `names` call them in errors.
+    """Compare two processed scans, pixel by pixel and patch by patch; `names` stand for them in error messages.
 
     Raises
     ------
@@ -479,13 +503,13 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
     known_in_both = is_in_both & a.permittivity.mask & b.permittivity.mask[same_place]
     eps = np.where(known_in_both, a.permittivity.value - b.permittivity.value[same_place], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
-        stated = np.abs(p) / np.hypot(a.p_std, b.p_std[same_place])
-    scatter = measure_scatter(stated)
-    sigmas = stated / scatter
-    judged = sigmas[np.isfinite(sigmas)]
+        in_stated_errors = np.abs(p) / np.hypot(a.p_std, b.p_std[same_place])
+    scatter = measure_scatter(in_stated_errors)
+    sigmas = in_stated_errors / scatter
+    known_sigmas = sigmas[np.isfinite(sigmas)]
     significant_share = None
-    if judged.size:
-        significant_share = float((judged > SIGNIFICANT_STDS).mean())
+    if known_sigmas.size:
+        significant_share = float((known_sigmas > SIGNIFICANT_STDS).mean())
     figures = ComparisonFigures(
         patches=_pair_patches(a.segments, b.segments),
         notes=_collect_notes(a, b, scatter),
@@ -498,11 +522,12 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
 
 
 def measure_scatter(differences: Real) -> float:
-    """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| relative to stated errors; NaN without.
+    """Estimate the scatter of unchanged pixels relative to their stated errors, 0.1 to 1; NaN if no error is known.
 
-    Stated errors include those that both scans share (leakage, metal reference, sidelobes), which cancel in a
-    difference. Taken from the median, so that changes of less than half of the image hardly matter: the median of a
-    complex normal error with unit variance in each part is sqrt(2 ln 2).
+    `differences` are |difference of P| / stated error. The scatter is below 1, because stated errors include those that
+    both scans share (leakage, metal reference, sidelobes), which cancel in a difference. It is estimated from the
+    median, so that changes in less than half of the image hardly matter: the median of a complex normal error with unit
+    variance in each part is sqrt(2 ln 2).
     """
     finite = differences[np.isfinite(differences)]
     if finite.size == 0:
@@ -511,7 +536,7 @@ def measure_scatter(differences: Real) -> float:
 
 
 def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the index of the nearest of `second` for each of `first` (mm), and True if it is within half a pixel."""
+    """Return for each of `first` (mm) the index of the nearest of `second`, and if they agree within half a pixel."""
     nearest_index = np.abs(first[:, None] - second[None, :]).argmin(axis=1)
     pixel = max(abs(second[1] - second[0]), abs(first[1] - first[0]))
     # Half a pixel, and a hundredth of one for rounding.
@@ -519,7 +544,7 @@ def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np
 
 
 def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
-    """List what limits a comparison of two scans; `scatter` as of :func:`measure_scatter`."""
+    """Return notes on what limits a comparison of two scans; `scatter` is the result of :func:`measure_scatter`."""
     notes = []
     if scatter < 1:
         notes.append(
@@ -528,7 +553,7 @@ def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
         )
     a_deg = float(np.degrees(a.theta_rad))
     b_deg = float(np.degrees(b.theta_rad))
-    # Chosen: |P| changes by about a tenth in a degree.
+    # |P| changes by about a tenth in a degree; the limit is chosen.
     if abs(a_deg - b_deg) > 0.5:
         notes.append(f"the incidence angles differ: {a_deg:.1f} and {b_deg:.1f} degrees; P depends on them")
     if a.simulated != b.simulated:

@@ -1,7 +1,7 @@
 """The scans under a folder: a list with one line for each, and the folder of a scan by its name.
 
-Nothing is read again that has not changed, so that thousands of scans are listed without delay: a line of the list is
-kept with the times and sizes of the files that it was made from, also over a restart (`Index`).
+Thousands of scans are listed without delay, because a scan is read again only after its files have changed: each line
+of the list is kept together with the times and sizes of the files that it was made from, also over a restart (`Index`).
 """
 
 from __future__ import annotations
@@ -31,30 +31,31 @@ from polysight_shared.files import write_atomically
 from polysight_shared.findings import Finding
 
 READ_S = 3.0
-"""Time limit for reading one folder of the list; it is then listed as `silent` until the read returns; chosen."""
+"""Time limit for reading one folder; chosen. A folder that takes longer is listed as `silent` until it is read."""
 PART_S = 0.1
-"""Length of the parts in which a list is read before it is asked for, and of the pauses between them; chosen."""
+"""A list that no client waits for is read in parts of this length, with pauses of the same length; chosen."""
 PROGRAM_FOLDER = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
 # Deepest level of folders in which scans are searched for; chosen.
 MAX_DEPTH = 4
 # Largest number of scans that are listed below one folder of the root; chosen.
 MAX_SCANS = 5000
-# End of a program's log that is read: its last messages; chosen.
+# Length of the end of a program's log that is read, with its last messages; chosen.
 LOG_BYTES = 16384
 # Longest record of a started program that is read: its command line is short; chosen.
 MAX_RECORD_BYTES = 100_000
-# Longest exit status, with its sign and the end of its line; chosen.
+# Longest text of an exit status that is read, with its sign and the end of its line; chosen.
 MAX_STATUS_BYTES = 8
 # Characters of a program's message, and of its cause and remedy, that the list shows; chosen.
 MESSAGE_CHARACTERS = 300
 REMEDY_CHARACTERS = 500
-# Names of materials in a line of the list; chosen.
+# Largest number of names of materials, and of boxes, in a line of the list; chosen.
 MAX_NAMES = 12
 CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 # Time that a program may take from the last line of a manifest to its first sign of life; chosen.
 GRACE_S = 20.0
-# Files of a scan that its summary is made from; products are in a folder of the scan, or alone.
+# Files of a scan that its summary is made from. Products are in the folder `products` of a scan, or have a folder
+# without a scan.
 _PRODUCTS = (IMAGE, MATERIALS, QUALITY)
 SUMMARISED = (MANIFEST, NOTES_FILE, *(f"{place}{name}" for place in ("", "products/") for name in (LABELS, *_PRODUCTS)))
 Stamp = tuple[tuple[int, int], ...]
@@ -70,30 +71,30 @@ class Summary(msgspec.Struct, frozen=True):
     Attributes
     ----------
     name
-        Its path below the folder that is listed, with `/`.
+        Path of the scan's folder below the folder that is listed, with `/`.
     state
         One of :data:`polysight.acquisition.BADGES`: `lost` (its program was killed), `frozen` (it gives no sign of
         life), `begun` (a folder in which a program was started and no scan is yet), `products` (without rows),
         `silent` (its folder does not answer: a disconnected network drive), ...
     rows, committed
-        Of the plan, and those that count.
+        Number of rows of the plan, and of rows whose recording was completed.
     reason
-        Why its program ended, or failed; "" if it is not known.
+        Why the scan's program ended or failed; "" if it is not known.
     verdict
-        Level of its products' verdict; "" where it was not processed or not judged, "damaged" where they cannot be
-        read.
+        Level of the products' verdict; "" if the scan was not processed or not judged, "damaged" if the products cannot
+        be read.
     processed
         True if there are materials.
     images_only
         True if there are images without materials: by `polysight image`, or before processing has ended.
     seconds
-        When it began, since 1970; 0 where nothing says.
+        Start of the scan in seconds since 1970; 0 if it is not known.
     generation
-        Changes whenever its products do, see :func:`read_generation`.
+        Text that changes whenever the products do, see :func:`read_generation`.
     labelled
         Names of boxes drawn by hand.
     notes, tags
-        The operator's; `notes` has the problem if their file is damaged.
+        Notes and tags of the operator. If their file is damaged, `notes` says so.
     """
 
     name: str
@@ -128,7 +129,8 @@ def read_generation(products: Path) -> str:
         except OSError:
             stamps.append("-")
             continue
-        # Files come and go in the folder without being products: of the folder, only its number counts.
+        # The time of the folder also changes with files that are not products. Its inode number changes only when the
+        # folder is replaced.
         stamp = status.st_mtime_ns
         if path == products:
             stamp = status.st_ino
@@ -151,7 +153,11 @@ def _read_stamp(folder: Path) -> Stamp:
 
 
 def summarise(folder: Path, name: str) -> Summary:
-    """Summarise a scan without signs of life: one that has not ended is `lost` here, see :func:`add_signs_of_life`."""
+    """Summarise a scan from its files.
+
+    A scan that has not ended gets the state `lost` here; :func:`add_signs_of_life` corrects it if the scan's program is
+    alive.
+    """
     try:
         notes = read_notes(folder)
     except DataError as e:
@@ -242,7 +248,11 @@ class Program(msgspec.Struct, frozen=True):
 
 
 class ProgramRecord(msgspec.Struct, frozen=True):
-    """Content of `program/<kind>.json`: process number and start time (:func:`read_start_ticks`), and the command."""
+    """Content of `program/<kind>.json`: process number, its start time (`ticks`), command, and time in UTC.
+
+    Process numbers are used again: a process with this number is the program only if its :func:`read_start_ticks` are
+    the same.
+    """
 
     pid: int
     ticks: int
@@ -330,7 +340,7 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
     started here ended before it made a scan.
     """
     if summary.state == "begun":
-        # A killed program changes no file.
+        # A program that is killed changes no file: its failure cannot be a part of the summary that is kept.
         failure = explain_failure(find_program(folder, "scan"))
         if failure is None:
             return summary
@@ -347,7 +357,7 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
     if life is not None and life.killed:
         return replace(summary, state="lost")
     if time.time() - written_s >= patience_s:
-        # A folder that was copied from another machine has that one's signs of life.
+        # In a folder that was copied from another machine, the signs of life are from there.
         if life is not None and life.is_here:
             return replace(summary, state="frozen")
         return replace(summary, state="lost")
@@ -375,24 +385,25 @@ def _parse_utc(utc: str) -> float:
 # --- the list ---
 
 StampedSummary = tuple[Stamp, Summary]
-# Raised when summaries are made in another way from the same files.
+# Version of the index. A release that makes other summaries from the same files has a higher one.
 INDEX_VERSION = 1
-# A file that is written twice within the clock's step of a drive keeps its time (FAT: 2 s): what was written so short a
-# while ago is read again after a restart.
+# Step of a drive's clock (FAT: 2 s). A file that is written twice within a step keeps its time: a summary from files
+# that were changed less than a step before the index is written is not put into it, and made again after a restart.
 CLOCK_STEP_S = 2.0
-# A scan at work changes the list with every row; each index is flushed to disk. The interval is chosen.
+# Shortest time between two writes of the index; chosen. A running scan changes the list with every row, and each write
+# is flushed to disk.
 INDEX_INTERVAL_S = 60.0
 
 
 class Index(msgspec.Struct, frozen=True):
-    """Summaries by name that a later process need not read again while their files have the same stamps."""
+    """Summaries by name, each with the stamp of its files; a later process uses those whose stamps are unchanged."""
 
     version: int
     summaries: dict[str, StampedSummary]
 
 
 def read_index(path: Path) -> dict[str, StampedSummary]:
-    """Read the summaries of an earlier process; none if there is no index, or it is damaged or of another version."""
+    """Read the summaries of an earlier process; empty if there is no index, or it is damaged or of another version."""
     if not is_plain(path):
         return {}
     try:
@@ -405,7 +416,7 @@ def read_index(path: Path) -> dict[str, StampedSummary]:
 
 
 def write_index(path: Path, summaries: dict[str, StampedSummary]) -> None:
-    """Replace the index as a whole, so that a kill leaves the old one; a folder that is read-only has none."""
+    """Replace the index atomically, so that a kill leaves the old one. In a read-only folder nothing is written."""
     if path.parent.is_symlink():
         return
     newest_ns = int((time.time() - CLOCK_STEP_S) * 1e9)
@@ -426,7 +437,7 @@ class Scans:
     root
         Folder to look under.
     only
-        Name of the one scan in it that is shown; it need not be there yet. None: all.
+        Name of the only scan that is shown, which may not exist yet. None: all scans.
     index
         File that keeps the list over a restart, see :class:`Index`. None: it is not kept.
     """
@@ -446,14 +457,14 @@ class Scans:
         self._reading: set[str] = set()
         self._lock = threading.Lock()
         self.unread = 0
-        """Entries of the root that the last list lacks, because its time was over."""
+        """Number of entries of the root that the last list lacks, because its time limit had passed."""
 
     def list(self, within_s: float = math.inf) -> Sequence[Summary]:
         """Return every scan, the newest first; what has changed since the last call is read again.
 
-        A folder that takes longer than `READ_S` is listed as `silent`. Its thread cannot be ended: the folder is read
-        again when that has returned. After `within_s` the list has the entries that were read so far; the next call
-        continues.
+        A folder that takes longer than `READ_S` is listed as `silent`. The thread that reads it cannot be ended: the
+        folder is read again after the thread has returned. After `within_s` the list has the entries that were read so
+        far, and the next call continues with the others.
         """
         with self._lock:
             if self.only is not None:
@@ -530,11 +541,11 @@ class Scans:
         """Return the names of the scans at or below an entry of the root folder."""
         if self.only is not None or is_scan(self.root / entry):
             return iter([entry])
-        return _find_scan_names(self.root / entry, f"{entry}/", 2)
+        return _find_scan_names(self.root / entry, prefix=f"{entry}/", depth=2)
 
     def iterate_signs_of_life(self) -> Iterator[tuple[str, SignOfLife]]:
         """Yield name and last sign of life of each scan that runs, or was killed; no scan is read."""
-        places = _find_scans(self.root, "", 1)
+        places = _find_scans(self.root, prefix="", depth=1)
         if self.only is not None:
             places = iter([(self.only, self.root / self.only)])
         for name, path in places:
@@ -564,9 +575,9 @@ class Scans:
         Parameters
         ----------
         name
-            As the list has it.
+            Name of the scan in the list.
         new
-            A scan to be made: it need not be there.
+            True for a scan that is to be made: its folder need not exist.
 
         Raises
         ------
@@ -614,7 +625,8 @@ class Scans:
         if stored_summary is None or stored_summary[0] != stamp:
             stored_summary = (stamp, summarise(folder, name))
             self._summaries[name] = stored_summary
-        return add_signs_of_life(folder, stored_summary[1])
+        _, summary = stored_summary
+        return add_signs_of_life(folder, summary)
 
 
 def folder_bytes(folder: Path) -> int:

@@ -1,10 +1,10 @@
 """The catalogue: permittivities of real materials near 77 GHz from the open literature (catalogue.toml).
 
-The file has three tables. `sources`: citation of each key. `kinds`: for each kind of material its generic names
-("wood") and the default spread between specimens. `materials`: a line each.
+The file has three tables. `sources` has the citation of each publication by its key. `kinds` has, for each kind of
+material, its generic names ("wood") and the default spread between specimens. `materials` has a line for each material.
 
-Two names are of one material if they are equal after `normalise_name`, if both are names of one entry, or if one is the
-generic name of the other ("wood" and "oak", but not "oak" and "pine").
+Two names may mean one material if they are equal after `normalise_name`, if both are names of one entry, or if one is
+the generic name of the other ("wood" and "oak", but not "oak" and "pine").
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class CatalogueMaterial(msgspec.Struct, frozen=True):
     name, aliases
         Name, and other names of the same material; unique in the catalogue.
     generic
-        Wider names that the material also goes by: that of its kind, "glass" of borosilicate glass.
+        Wider names of the material, such as that of its kind: "glass" for borosilicate glass.
     kind
         Class of the material: "polymer", "wood", "liquid", ...
     permittivity
@@ -71,7 +71,10 @@ class _Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A line of the file: eps' and eps'' (positive), frequency in GHz, aliases (`also`); None: the kind's spread."""
+    """A line of the file: eps' (`real`), eps'' (`loss`, positive), frequency in GHz, aliases (`also`), and so on.
+
+    Without a `spread` of its own the material has that of its kind.
+    """
 
     name: str
     kind: str
@@ -142,8 +145,12 @@ def normalise_name(name: str) -> str:
 
 @cache
 def _index_names() -> dict[str, CatalogueMaterial]:
-    """Return the materials by each of their normalised names."""
-    return {normalise_name(name): m for m in load_catalogue() for name in (m.name, *m.aliases)}
+    """Return normalised name or alias to its material."""
+    materials = {}
+    for material in load_catalogue():
+        for name in (material.name, *material.aliases):
+            materials[normalise_name(name)] = material
+    return materials
 
 
 def find_material(name: str) -> CatalogueMaterial | None:
@@ -152,7 +159,7 @@ def find_material(name: str) -> CatalogueMaterial | None:
 
 
 def is_same_material(name: str, other: str) -> bool:
-    """True if both names are, or may be, of one material: equal, aliases, or one the generic name of the other."""
+    """True if both names may mean one material: equal, aliases, or one is the generic name of the other."""
     first = normalise_name(name)
     second = normalise_name(other)
     return first == second or second in _collect_all_names(first) or first in _collect_all_names(second)
@@ -160,7 +167,7 @@ def is_same_material(name: str, other: str) -> bool:
 
 @cache
 def _collect_all_names(name: str) -> frozenset[str]:
-    """Return a normalised name with its aliases and generic names; alone if the catalogue does not have it."""
+    """Return a normalised name with its aliases and generic names; only itself if it is not in the catalogue."""
     material = _index_names().get(name)
     if material is None:
         return frozenset((name,))

@@ -1,14 +1,15 @@
-"""Name the pixels and patches of a scan by a reference library; the classifier of the POLySIGHT paper.
+"""Name the pixels and patches of a scan with a reference library; the classifier of the POLySIGHT paper.
 
 `MODELS` lists the models: the paper's KNN and the discriminant of error sources. `Classifier` uses the library's model,
 or the requested one.
 
-`PaperKnn` is the paper's weighted k-nearest-neighbour classifier on |H|, |V| and complex P: scikit-learn's, with the
-distance of `library.py`.
+`PaperKnn` is the paper's classifier: the k nearest pixels of the library vote on the name of a pixel. The distance of
+two pixels is lambda_H d_H + lambda_V d_V + lambda_P d_P, with their distances in |H|, |V| and complex P. There are
+several measures for d_P (`library.py`). The three weights and the measure are fitted by cross-validation on the
+training data, with whole scans left out.
 
-The three weights and the measure are fitted by cross-validation on the training data, with whole scans left out. A
-nearest neighbour exists for every patch; unknown patches are recognised by the materials' distributions
-(`discriminant.py`), as for every model.
+Every patch has nearest neighbours, also one of a foreign material. Whether it is unknown is therefore decided by the
+distributions of the materials (`discriminant.py`), for each model.
 """
 
 from __future__ import annotations
@@ -53,19 +54,22 @@ from polysight_shared.errors import DataError, ErrorCode
 WEIGHT_GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread; chosen."""
 UNKNOWN_MARGIN = 2.0
-"""Distance beyond which a pixel is unknown, over the 99th percentile of the material's own pixels between scans.
+"""A pixel is unknown beyond this multiple of the 99th percentile of distances between pixels of the same material in
+different scans.
 
 Chosen: a smaller margin calls more pixels of new placements unknown, a larger one accepts more foreign materials."""
 FIT_PIXELS = 3
-"""Pixels of each patch to fit weights: pixels of a patch are similar, and the cost grows with the square; chosen."""
+"""Number of pixels of each patch that are used to fit weights; chosen. Pixels of a patch are similar, and the cost
+grows with the square of their number."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the channels (the paper's lambda_H, lambda_V, lambda_P), how P's distance is measured, and neighbours.
+    """Weights `h`, `v`, `p` of the channels (the paper's lambda_H, lambda_V, lambda_P), measure of P's distance,
+    neighbours.
 
-    A weight multiplies the distance in its channel. Names depend on the ratios of `h`, `v` and `p`; thresholds of
-    distances hold for the weights that they were fitted with. The number of neighbours is chosen.
+    A weight multiplies the distance in its channel. Only the ratios of the weights affect names, but thresholds of
+    distances are valid only for the weights with which they were fitted. The number of neighbours is chosen.
     """
 
     h: float = 1.0
@@ -104,8 +108,9 @@ def combine(channels: Distances, weights: Weights) -> Real:
 class PaperKnn(Model):
     """The paper's classifier.
 
-    Weights are fitted unless they are given; with "H" or "V" alone there is none to fit, with "P" the measure only.
-    `thresholds` are the largest distances of known pixels by material; without an entry there is no limit.
+    Weights are fitted unless they are given; with the `channels` "H" or "V" there is nothing to fit, with "P" only the
+    measure. `thresholds` maps a material to the largest distance of its known pixels; without an entry there is no
+    limit.
     """
 
     def __init__(
@@ -135,7 +140,7 @@ class PaperKnn(Model):
             count, weight_h=weights.h, weight_v=weights.v, weight_p=weights.p, measure=weights.measure
         )
         self._materials, self._material_of_pixel = np.unique(samples.names, return_inverse=True)
-        # Numbers, which scikit-learn checks faster than names.
+        # The classes are numbers instead of names, because scikit-learn checks numbers faster.
         self._knn.fit(invert_ratios(samples.x), self._material_of_pixel)
         self._samples = samples
         self._distributions = None
@@ -143,7 +148,7 @@ class PaperKnn(Model):
 
     @property
     def distributions(self) -> ErrorDiscriminant:
-        """The materials' distributions, fitted when they are asked for: pixels are named without them."""
+        """The materials' distributions. They are fitted at the first use, because pixels are named without them."""
         if self._distributions is None:
             self._distributions = ErrorDiscriminant().fit(self._samples)
         return self._distributions
@@ -151,8 +156,9 @@ class PaperKnn(Model):
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
         """Name the pixels and patches of one scan, patches by the majority of their pixels.
 
-        `x` features [n, columns], `patches` patch number [n]. A patch's distance is at least that to its material's
-        distribution: beyond 1 its name does not hold, and the caller calls it unknown.
+        `x` are features [n, columns], `patches` the number of each pixel's patch [n]. The distance of a patch is that
+        of its votes or that to the distribution of its material, whichever is larger. If it is above 1, the caller
+        calls the patch unknown.
         """
         voted = name_by_majority(*self.classify_pixels(x), patches)
         distances = self.distributions.by_scan(x, patches).distances
@@ -163,7 +169,7 @@ class PaperKnn(Model):
         return replace(voted, distance=np.maximum(voted.distance, distance_to_material))
 
     def classify_pixels(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Return each pixel's name [n], and its mean distance to its neighbours over the material's threshold [n]."""
+        """Return the name of each pixel [n], and its mean distance to its neighbours / the material's threshold [n]."""
         distance, nearest = self._knn.kneighbors(invert_ratios(x))
         votes = count_votes(self._material_of_pixel[nearest], self._materials.size)
         names = self._materials[votes.argmax(axis=1)]
@@ -180,9 +186,9 @@ class Fit:
     weights
         Best weights.
     pixel_accuracy
-        Accuracy of these weights on scans left out, mean over the materials of two or more scans.
+        Accuracy of these weights on scans left out: mean over the materials that are in two or more scans.
     by_channel
-        Pixel accuracy with H, V, or P alone, same splits.
+        Pixel accuracy with H, V, or P alone, on the same scans left out.
     thresholds
         Material to the distance beyond which a pixel is unknown.
     """
@@ -196,9 +202,9 @@ class Fit:
 def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     """Fit the paper's three weights and the measure of P.
 
-    Every combination of the grid is judged on scans left out; among the combinations within half a percent of the best
-    the one with the most even weights is taken, because extreme weights discard information. With `channels` "P" only
-    the measure is fitted.
+    The accuracy of every combination of the grid is measured on scans left out. Among the combinations within half a
+    percent (chosen) of the best, the one with the most even weights is taken, because extreme weights discard
+    information. With `channels` "P" only the measure is fitted.
 
     Raises DataError if no material is in two scans: a split by pixel would be too optimistic.
     """
@@ -212,8 +218,9 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     few = _draw_few_pixels(samples)
     neighbours = Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
-    # Every pixel must find as many neighbours in other scans.
-    judge = _LeftOut.prepare(few, same_scan, min(neighbours, int((~same_scan).sum(axis=1).min())))
+    # As many pixels vote as every pixel has in other scans.
+    fewest_others = int((~same_scan).sum(axis=1).min())
+    judge = _LeftOut.prepare(few, same_scan, min(neighbours, fewest_others))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(WEIGHT_GRID, WEIGHT_GRID)]
     tried: list[tuple[float, float, Weights]] = []
     p_alone: dict[str, float] = {}
@@ -224,14 +231,14 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
         for wh, wv in grid:
             w = Weights(wh * scale[0], wv * scale[1], scale[2], measure)
             accuracy = judge.accuracy(combine(distances, w))
-            # Greatest for weights of one; a weight of 0 counts as 0.1. Of weights that are right alike (0.5 % less at
-            # most, chosen) the most even ones are taken.
+            # The evenness is greatest, 0, if both weights are 1; a weight of 0 counts as 0.1.
             evenness = -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1)))
             tried.append((accuracy, evenness, w))
             if wh == wv == 0:
                 p_alone[measure] = accuracy
     top = max(accuracy for accuracy, _, _ in tried)
-    accuracy, _, weights = max((t for t in tried if t[0] >= top - 0.005), key=lambda t: t[1])
+    nearly_best = [(evenness, accuracy, w) for accuracy, evenness, w in tried if accuracy >= top - 0.005]
+    _, accuracy, weights = max(nearly_best, key=lambda candidate: candidate[0])
     distances = compute_channel_distances(few.x, few.x, weights.measure)
     accuracy_by_channel = {c: judge.accuracy(distances[i]) for i, c in enumerate("hv")}
     accuracy_by_channel["p"] = p_alone[weights.measure]
@@ -249,9 +256,11 @@ def _draw_few_pixels(samples: Samples) -> Samples:
 
 @dataclass(frozen=True)
 class _LeftOut:
-    """Judges distances by votes of `voters` pixels of other scans.
+    """Judges a distance of pixels: each of n pixels is named by the votes of its `voters` nearest pixels of other
+    scans.
 
-    `classes` [n] numbers the materials; `shared` are those of two or more scans; `same_scan` [n, n].
+    `classes` [n] is the number of each pixel's material, `shared` are the numbers of materials in two or more scans,
+    and `same_scan` [n, n] is true for two pixels of one scan.
     """
 
     classes: npt.NDArray[np.intp]
@@ -269,26 +278,29 @@ class _LeftOut:
         """Return the pixel accuracy for distances [n, n], mean over the materials of two or more scans."""
         distance_to_other_scans = np.where(self.same_scan, np.inf, distance)
         count = np.bincount(self.classes)
-        # The nearest in any order: votes need none. Values are partitioned several times faster than their indices.
+        # Find the nearest pixels, in any order. Values are partitioned several times faster than their indices.
         last = self.voters - 1
         is_near = distance_to_other_scans <= np.partition(distance_to_other_scans, last, axis=1)[:, last, None]
         members = (self.classes[:, None] == np.arange(count.size)).astype(np.float32)
         votes = is_near.astype(np.float32) @ members
-        # If several pixels are as far as the last one that votes, the partition of indices decides which of them votes.
+        # Too many pixels are near if several have the same distance as the last one that votes. Then the partition of
+        # indices decides which of them vote.
         tied = is_near.sum(axis=1) > self.voters
         if tied.any():
             nearest = np.argpartition(distance_to_other_scans[tied], last, axis=1)[:, : self.voters]
             votes[tied] = count_votes(self.classes[nearest], count.size)
         voted = votes.argmax(axis=1)
-        return float(np.mean((np.bincount(self.classes, voted == self.classes) / count)[self.shared]))
+        accuracy_of_class = np.bincount(self.classes, voted == self.classes) / count
+        return float(np.mean(accuracy_of_class[self.shared]))
 
 
 def _compute_thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, float]:
-    """Return thresholds: 99th percentile of the distances of a material's pixels between scans, times a margin.
+    """Return material to its threshold: `UNKNOWN_MARGIN` times the 99th percentile of its distances between scans.
 
-    At least half of the materials' median: metal is the reference, so its own distances are zero. At most three times
-    the median: one unusual specimen must not make a material accept everything. Both are chosen. A material of a single
-    scan has no threshold.
+    The distance of a pixel is its mean distance to the nearest pixels of the same material in other scans. A threshold
+    is at least half of the median over the materials, because the distances of metal, the reference, are zero. It is at
+    most three times the median: one unusual specimen must not make a material accept everything. Both factors are
+    chosen. A material of a single scan has no threshold.
     """
     out = {}
     for name in np.unique(few.names):
@@ -336,8 +348,8 @@ class Classifier:
     library
         Reference patches with the fitted model.
     weights
-        Weights of the paper's KNN; they select that model, and replace the library's own weights, but not its
-        thresholds: give weights of the same scale.
+        Weights of the paper's KNN. They select that model, and replace the library's own weights, but not its
+        thresholds: weights must have the scale of the library's.
     model
         A key of `MODELS` or `MODEL_OF_OPTION`; default: the library's model.
     angles_deg
@@ -424,7 +436,7 @@ class Classifier:
             if eps is None:
                 out.append(Kind(name, None))
                 continue
-            # Each of its patches counts as a specimen of its own.
+            # Each patch of the material counts as a separate specimen.
             count = sum(e.name == name for e in self.library.entries)
             real, loss = (float(s) * float(np.sqrt(1 + 1 / count)) for s in spread[name])
             out.append(Kind(name, eps, (real, loss)))
@@ -475,7 +487,10 @@ class Classifier:
 
 
 def _check_model_name(given_name: str) -> str:
-    """Return the key of `MODELS` for a name, a short or an earlier one. Raises DataError if there is none."""
+    """Return the key of `MODELS` for a name of a command, a library file or an earlier release.
+
+    Raises DataError if there is none.
+    """
     name = DISCRIMINANT_MODEL if given_name in EARLIER_MODELS else MODEL_OF_OPTION.get(given_name, given_name)
     if name not in MODELS:
         raise DataError(

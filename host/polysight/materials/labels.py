@@ -1,9 +1,12 @@
-"""Names of patches by people and simulators: label files (`labels.json`) and truth files (`truth.json`).
+"""Label files (`labels.json`) and truth files (`truth.json`): patches with names.
 
-A label file holds boxes with names, the metal reference among them, and their specimens. `polysight label` writes the
-boxes of a person, in millimetres; `polysight process` writes a box around the interior of each patch that it found, in
-pixels, named by the classifier. Both forms are read, and the published data set's files too. `Labels.patches` makes
-patches of the boxes; `check_labels` checks a file before training, `clean_name` and `normalise_box_name` one name.
+A label file contains boxes with the names of their materials; one may be the metal reference, and a box may have the
+name of its specimen. `polysight label` writes boxes drawn by a person, in millimetres. `polysight process` writes a box
+around the interior of each patch that it found, in pixels, with the classifier's name. Both forms are read, and also
+the files of the published data set. `Labels.patches` makes patches of the boxes; `check_labels` checks a file before
+training, `clean_name` and `normalise_box_name` check one name.
+
+A truth file contains the plates of a simulated scene.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ from polysight.store import TRUTH
 from polysight_shared.errors import DataError, ErrorCode, quote
 from polysight_shared.files import read_json
 
-# Name of the label files that `polysight label` writes; those of the published data have the names of their scans.
+# Name of the label files that `polysight label` writes. Label files of the published data have the names of their
+# scans.
 _DRAWN_HERE = "labels.json"
 
 
@@ -86,7 +90,7 @@ def specimen_seed(path: Path) -> int | None:
 def find_truth(folder: Path) -> tuple[Plates, str]:
     """Read the plates of a scan folder's truth.json, if there is one.
 
-    If the file is invalid there are no plates, and the note gives the reason in one line.
+    If the file is invalid, no plates are returned, and the text gives the reason in one line; otherwise it is "".
     """
     path = folder / TRUTH
     if not path.exists():
@@ -98,10 +102,10 @@ def find_truth(folder: Path) -> tuple[Plates, str]:
 
 
 def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
-    """Read a plate of a truth file; metal, strips and stacks of layers have no permittivity of their own.
+    """Read a plate of a truth file; plates of metal, strips or layers have no single permittivity.
 
     `strips_deg` is the direction of ideal thin metal strips, `layers` a stack from front to back. Raises KeyError,
-    TypeError, ValueError or OverflowError for a malformed one.
+    TypeError, ValueError or OverflowError for a malformed plate.
     """
     cx, cy = (float(c) for c in raw["centre_mm"])
     width, height = (float(s) for s in raw["size_mm"])
@@ -138,7 +142,7 @@ def remove_specimen(name: str) -> str:
 
 def format_box(box: Box) -> str:
     """Format a box: `x -22.5 to 22.5, y 0.0 to 45.0 mm`."""
-    # Negative zero plus zero is zero: no "-0.0".
+    # Adding zero removes the sign of a negative zero, which would be printed as "-0.0".
     x0, y0, x1, y1 = (b + 0.0 for b in box)
     return f"x {x0:z.1f} to {x1:z.1f}, y {y0:z.1f} to {y1:z.1f} mm"
 
@@ -154,12 +158,12 @@ class Labels:
     unit
         Unit of the boxes.
     metal
-        Name of the box with the metal reference; None: every box with the name of a metal counts as metal (drawn by
-        hand, only one may have such a name), and processing takes the first of them.
+        Name of the box with the metal reference. If it is None, every box with the name of a metal counts as metal, and
+        processing takes the first of them as its reference; among boxes drawn by hand only one may have such a name.
     specimens
-        Name of a box to its physical piece, if known.
+        Name of a box to the name of its specimen, the physical piece of material, if known.
     by_hand
-        True if a person drew and named them; boxes of `polysight process` have the classifier's names.
+        True if a person drew and named the boxes; boxes of `polysight process` have the classifier's names.
     description
         Free text.
     """
@@ -289,7 +293,7 @@ def pack_labels(labels: Labels) -> bytes:
 def make_patches_from_plates(
     plates: Sequence[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Return patches at the known plates, and a patch's number to its name; several plates may have the same name.
+    """Return patches at the known plates, and the number of each patch to its name, which several plates may share.
 
     Pixels nearer than `margin_mm` to a plate's edge belong to its patch, but not to the patch's interior. Raises
     DataError if a plate has no pixel.
@@ -306,7 +310,7 @@ def make_patches_from_labels(
     unit: Literal["pixel", "mm"] = "pixel",
     margin_mm: float = 0.0,
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Make patches of boxes, drawn by hand or known; return them, and the box's name by the patch's number, from 1.
+    """Make patches of boxes; return them, and the number of each patch, from 1, to the name of its box.
 
     `boxes` are name to (x0, y0, x1, y1): pixel indices (end excluded), or millimetres from the image centre. A patch
     is the whole box; its interior begins `margin_mm` inside. Hand-drawn boxes usually lie inside the material already.
@@ -341,8 +345,8 @@ def make_patches_from_labels(
 LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""
-# Overlap of boxes, and part outside the image, that is accepted. Label files have three decimals, so that edges that
-# touch may differ by 0.001 mm. Chosen ten times as large, which is far below a pixel.
+# Accepted overlap of two boxes, and accepted width of the part of a box outside the image. Label files have three
+# decimals, so that edges that touch may differ by 0.001 mm. Chosen ten times as large, which is far below a pixel.
 _TOLERANCE_MM = 0.01
 # Invisible characters: two names that differ by one of them look the same.
 _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")
@@ -418,10 +422,9 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
     extent = image_extent_mm(x_m, y_m)
     for name, box in labels_mm.boxes.items():
         clean_box = normalise_box_name(name)
-        if existing_name := next(
-            (other_name for other_name in boxes if other_name.casefold() == clean_box.casefold()), None
-        ):
-            raise make_name_taken_error(clean_box, existing_name)
+        same_names = [existing for existing in boxes if existing.casefold() == clean_box.casefold()]
+        if same_names:
+            raise make_name_taken_error(clean_box, same_names[0])
         boxes[clean_box] = _check_box(clean_box, box, extent)
         mask = box_mask(box, x_m, y_m)
         if valid is not None:
@@ -488,7 +491,7 @@ def _check_box(name: str, box: Box, extent: Box) -> Box:
 
 
 def _check_apart(name: str, a: Box, other_name: str, b: Box) -> None:
-    """Raise DataError if two boxes overlap, beyond rounding."""
+    """Raise DataError if two boxes overlap by more than rounding."""
     overlap_x = min(a[2], b[2]) - max(a[0], b[0])
     overlap_y = min(a[3], b[3]) - max(a[1], b[1])
     if overlap_x > _TOLERANCE_MM and overlap_y > _TOLERANCE_MM:

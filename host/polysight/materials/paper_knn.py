@@ -1,6 +1,6 @@
 """The POLySIGHT paper's nearest-neighbour classifier as an estimator of scikit-learn.
 
-It imports scikit-learn, which takes a second: import it where it is used.
+This module imports scikit-learn, which takes a second. Import it inside the functions that use it.
 """
 
 from __future__ import annotations
@@ -33,18 +33,23 @@ def paper_distance(
 ) -> Real:
     """Return the paper's distance of pixels a [n, columns] to b [m, columns], [n, m]; of two single pixels a number.
 
-    Columns are |H|, |V|, real and imaginary part of P for each incidence angle; `h`, `v` and `p` are the weights
-    lambda_H, lambda_V and lambda_P. A number of columns that is not a multiple of four is not of this kind, such as |H|
-    alone: then each column counts by itself.
+    Columns are |H|, |V|, real and imaginary part of P for each incidence angle, and the distance is
+
+        lambda_H d_H + lambda_V d_V + lambda_P d_P
+
+    with the weights `h`, `v` and `p`. If the number of columns is not a multiple of four they are other features, such
+    as |H| alone: then the distance is the sum of the absolute differences of the columns.
     """
     first = np.atleast_2d(np.asarray(a, np.float64))
     second = np.atleast_2d(np.asarray(b, np.float64))
     if first.shape[1] % COLUMNS_PER_ANGLE:
         distance = np.abs(first[:, None, :] - second[None, :, :]).sum(axis=2)
     else:
-        # `compute_channel_distances` takes 1/P in place of P. Without a weight of P its distance is not computed (0).
-        channels = compute_channel_distances(invert_ratios(first), invert_ratios(second), measure if p else None)
-        distance = h * channels[0] + v * channels[1] + p * channels[2]
+        # `compute_channel_distances` takes features with 1 / P instead of P. If P has no weight, its distance is not
+        # computed, and 0 is returned for it.
+        measure_of_p = measure if p else None
+        d_h, d_v, d_p = compute_channel_distances(invert_ratios(first), invert_ratios(second), measure_of_p)
+        distance = h * d_h + v * d_v + p * d_p
     if np.ndim(a) > 1 or np.ndim(b) > 1:
         return distance
     return distance[0, 0]
@@ -56,7 +61,7 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
     Parameters
     ----------
     n_neighbors
-        Number of neighbours that vote, each with one vote; all pixels if there are fewer.
+        Number of nearest pixels that vote, each with one vote; if there are fewer pixels, all of them vote.
     weight_h, weight_v, weight_p
         lambda_H, lambda_V and lambda_P.
     measure
@@ -104,11 +109,15 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
     ) -> Any:
         """Return the distances and indices of the nearest pixels, nearest first, [n, neighbours] each.
 
-        As that of scikit-learn, with distances of whole arrays: a metric that is called for each pair takes minutes.
+        The result is that of scikit-learn's method. Distances are computed for whole arrays, because a metric that is
+        called for each pair of pixels takes minutes.
         """
         check_is_fitted(self)
         pixels = self._fit_X if X is None else cast(Any, validate_data)(self, X, reset=False)
-        available = self.n_samples_fit_ - (X is None)
+        available = self.n_samples_fit_
+        if X is None:
+            # A pixel of the training data is not a neighbour of itself.
+            available -= 1
         neighbours: Any = n_neighbors or self.n_neighbors
         count = min(int(neighbours), available)
         nearest_indices = np.empty((len(pixels), count), np.intp)
@@ -116,7 +125,7 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
         for rows in gen_batches(len(pixels), _CHUNK):
             distance = self.metric(pixels[rows], self._fit_X)
             if X is None:
-                # A pixel is not a neighbour of itself.
+                # Exclude each pixel as its own neighbour.
                 row_indices = np.arange(rows.start, rows.stop)
                 distance[row_indices - rows.start, row_indices] = np.inf
             nearest_indices[rows] = find_neighbours(distance, count)

@@ -1,9 +1,10 @@
-"""Half spaces as seen by the rig, and the effect of differences between specimens.
+"""Features of half spaces, and how they change between specimens of a material.
 
 Two plates of the same material differ by some per cent in the real part of the permittivity and by tens of per cent in
 the loss (Fig. 17 of the POLySIGHT paper). A specimen deviates from its material by s = (d ln eps', d ln eps''), which
-is assumed to be normal. Eq. 2 of the paper, Fresnel's coefficients, gives the matrix F that converts s to deviations
-F s of ln|H|, ln|V| and arg P (P = H / V), relative to metal. F has rows for all angles, as they show the same specimen.
+is assumed to be normal. The features are ln|H|, ln|V| and arg P relative to metal, with P = H / V, at each angle of
+incidence. They deviate by F s: the matrix F is the derivative of Eq. 2 of the paper, Fresnel's coefficients. F has rows
+for all angles, because all of them show the same specimen.
 
 The thresholds near metal and the scale `SOFT_RATIO` are chosen.
 """
@@ -24,10 +25,10 @@ PUBLISHED_SPREAD = (0.027, 0.19)
 """Standard deviations of ln eps' and ln eps'' if a library has no estimate: root mean square of PET's and ceramic's in
 Fig. 17 of the paper (variances 0.0021 and 0.0295 of 3.78 and 4.75; 0.0255 and 0.1081 of 0.70 and 2.43)."""
 PRIOR_FREEDOM = 4.0
-"""Weight of `PUBLISHED_SPREAD` in the spread of all materials together, as a number of specimens. Chosen, as the next
-one: libraries have few specimens of a material."""
+"""Weight of `PUBLISHED_SPREAD` in the spread of all materials together, as a number of specimens; chosen. It counts,
+because libraries have few specimens of a material."""
 OWN_FREEDOM = 20.0
-"""Weight of the spread of all materials together in that of a single material, as a number of specimens."""
+"""Weight of the spread of all materials together in that of a single material, as a number of specimens; chosen."""
 METAL_WITHOUT_PERMITTIVITY = 0.25
 """|P - 1| or |1/P - 1|, the smaller, below which a patch gets no permittivity.
 
@@ -37,25 +38,26 @@ permittivity, and the error grows without bound towards P = 1.
 METAL_WITHOUT_BRIGHTNESS = 0.25
 """Measured |V/H - 1| below which |H| is not used to estimate leakage: metal has |H| = 1 with any leakage."""
 METAL_WITHOUT_ERROR = 0.25
-"""Median |V/H - 1| of a patch below which it has no error of its own, and gives no information on common errors."""
+"""Median |V/H - 1| of a patch below which no error of its own is estimated, and it is not used for common errors."""
 METAL_UNLIKE = 0.2
 """|V/H - 1| above which a patch is evidence that its reference is metal: water relative to water looks like metal
 relative to metal."""
 METAL_SPECIMENS = 0.1
-"""|V/H - 1| below which a material is metal, whose specimens do not differ."""
+"""|V/H - 1| below which a material counts as metal, whose specimens do not differ."""
 SOFT_RATIO = 0.05
 """|V / H| below which its errors are additive (leakage, noise) instead of relative (gain, phase)."""
-# Difference quotient of the features by ln eps' and ln eps''; chosen.
+# Step of ln eps' and ln eps'' in difference quotients of the features; chosen.
 _STEP = 1e-4
-# Expectation maximisation ends after these rounds, or when one changes the pooled variances by less than this share.
+# Expectation maximisation ends after this number of rounds, or earlier if a round changes the pooled variances by less
+# than this share.
 _ROUNDS = 300
 _SETTLED_CHANGE = 1e-3
-# Without any loss ln eps'' would not exist.
+# Least loss of a half space, since ln eps'' does not exist for a loss of 0.
 _LEAST_LOSS = 1e-3
 
 
 def soft_modulus(t: npt.ArrayLike) -> Real:
-    """Return the scale of errors of t = V / H [any]: `sqrt(|t|^2 + SOFT_RATIO^2)`, as V may be zero."""
+    """Return the scale of errors of t = V / H [any], `sqrt(|t|^2 + SOFT_RATIO^2)`; it is not zero if V is."""
     return np.asarray(np.hypot(np.abs(t), SOFT_RATIO), np.float64)
 
 
@@ -69,14 +71,17 @@ def features(permittivity: npt.ArrayLike, angles_rad: Sequence[float]) -> tuple[
 def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
     """Return the derivatives of ln|H|, ln|V| and arg P of a material by ln eps' and ln eps'', [3 * angles, 2].
 
-    `t` complex128 [angles] is its V / H. Zero for metal, and if the angles are not known.
+    `t` complex128 [angles] is V / H of the material. The result is zero for metal, and if the angles are not known.
     """
     if len(angles_rad) != len(t) or not np.isfinite(t).all() or bool((np.abs(t - 1) < METAL_SPECIMENS).any()):
         return np.zeros((3 * len(t), 2))
     eps = apparent_permittivity(t, angles_rad)
     log_h, half_space_t = features(eps, angles_rad)
     columns = []
-    for stretched in (complex(eps.real * np.exp(_STEP), eps.imag), complex(eps.real, eps.imag * np.exp(_STEP))):
+    # ln eps' or ln eps'' larger by `_STEP`.
+    real_stretched = complex(eps.real * np.exp(_STEP), eps.imag)
+    loss_stretched = complex(eps.real, eps.imag * np.exp(_STEP))
+    for stretched in (real_stretched, loss_stretched):
         stretched_log_h, stretched_t = features(stretched, angles_rad)
         change = relative(stretched_log_h - log_h, stretched_t - half_space_t, half_space_t)
         columns.append(change.ravel() / _STEP)
@@ -86,7 +91,8 @@ def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
 def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
     """Convert deviations of ln|H| and of t, [..., angles] each, to those of ln|H|, ln|V| and arg P, [..., angles, 3].
 
-    To first order; with :func:`soft_modulus` instead of |t|, so that they stay finite if V vanishes.
+    The result is of first order in the deviations. :func:`soft_modulus` takes the place of |t|, so that it stays finite
+    if V vanishes.
     """
     # dt / t: its real part is the change of ln|V / H|, its imaginary part that of arg(V / H) = -arg P.
     change_along_t = dt * np.exp(-1j * np.angle(t)) / soft_modulus(t)
@@ -94,9 +100,12 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
 
 
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
-    """Return the permittivity of the half space of t = V / H [angles]: mean of Eq. 3 over the angles, made passive."""
+    """Return the permittivity of the half space with t = V / H [angles]: the mean of Eq. 3 over the angles.
+
+    It is changed to a passive one if necessary.
+    """
     eps = complex(np.mean([complex(permittivity_from_ratio(q, angle)) for q, angle in zip(t, angles_rad, strict=True)]))
-    # At least 1.01: a half space of 1 would reflect nothing.
+    # The real part is at least 1.01: a half space of 1 would reflect nothing.
     return complex(max(eps.real, 1.01), min(eps.imag, -_LEAST_LOSS))
 
 
@@ -119,8 +128,9 @@ def fit_spread(
     equal gain errors of H and V (:func:`average_channels`).
 
     Return the variances of ln eps' and ln eps'' of each material, [materials, 2], and the covariance of placements,
-    [d, d]. The spread is that of all materials together, with the published spread as prior, corrected by each
-    material's own. A material with a single specimen shows no spread, but its patches count for the placements.
+    [d, d]. The spread of all materials together is estimated with the published spread as prior, and is then the prior
+    of each material's own spread. A material with a single specimen shows no spread, but its patches count for the
+    placements.
     """
     is_single = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
     has_spread = ~is_single & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)

@@ -1,4 +1,4 @@
-"""Inputs of processing: what the settings name (a file of labelled boxes, a metal plate's scan, the library)."""
+"""Inputs of processing that the settings name: a file of labelled boxes, the scan of a metal plate, and the library."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ from polysight_shared.geometry import incidence_deg
 
 @dataclass(frozen=True)
 class Inputs:
-    """Content of the files that settings name: the label file, and the processed scan of a metal plate.
-
-    None: the settings name none.
-    """
+    """Content of the label file and of the processed scan of a metal plate; None if the settings do not name it."""
 
     labels: Labels | None = None
     reference: PlaneReference | None = None
@@ -33,10 +30,11 @@ NO_INPUTS = Inputs()
 def convert_boxes_to_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> KnownScene:
     """Return the boxes of the label file as patches of an image with axes `x_m`, `y_m`, and the metal in the scene.
 
-    The metal is the given metal box; with a scan of a plate no metal in the scene is used; otherwise it is a box
-    that the labels declare metal, the first of several. Without label file the patches are searched for later.
+    If the settings give a metal box, it is the metal. Otherwise, with the scan of a metal plate, no metal in the scene
+    is used; without it, the metal is the first box that the labels declare to be metal. Without a label file, patches
+    are searched for later.
 
-    Raises DataError if a box holds no pixel; in labels drawn by hand also if they are invalid (`check_labels`).
+    Raises DataError if a box contains no pixel, and if labels drawn by hand are invalid (`check_labels`).
     """
     labels = inputs.labels
     if labels is None:
@@ -61,10 +59,10 @@ def explain_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) 
     if settings.model == "none":
         return f"Nothing {verb} named: naming was left out (--model none)."
     path = library_path(settings)
-    # The angle is that of H; the angle of V is nearly the same.
+    # This is the angle of H; the angle of V is nearly the same.
     angle = incidence_deg(rig, rig.receivers[0])
     known_angles = _load_library(path, _find_stamp(path)).angles_deg
-    # Classifier refuses an empty library.
+    # An empty library is refused later, by `Classifier`.
     if not known_angles or any(abs(library_angle - angle) <= SAME_ANGLE_DEG for library_angle in known_angles):
         return ""
     return (
@@ -82,8 +80,8 @@ def load_classifier(settings: Settings, rig: Instrument) -> Classifier | None:
     return _fit_classifier(path, _find_stamp(path), settings.model, incidence_deg(rig, rig.receivers[0]))
 
 
-# A scan's settings are checked with the classifier before its rows are read, and its patches are named with it after
-# that: it is fitted once. Two, as scans of two angles may be processed in turn.
+# A scan needs the classifier twice: to check its settings before its rows are read, and to name its patches afterwards.
+# Two classifiers are kept, because scans of two angles may be processed in turn.
 @lru_cache(2)
 def _fit_classifier(path: Path, stamp: tuple[int, int], model: str | None, angle_deg: float) -> Classifier:
     """Return the classifier of the library that the file `path` held at `stamp`."""
@@ -97,11 +95,11 @@ def _load_library(path: Path, stamp: tuple[int, int]) -> Library:  # noqa: ARG00
 
 
 def _find_stamp(path: Path) -> tuple[int, int]:
-    """Return what changes when a file is replaced: time of its last change in ns, and size; zeros if it is missing."""
+    """Return time of the last change (ns) and size of a file, which a new file does not share; zeros without a file."""
     try:
         status = path.stat()
     except OSError:
-        # Loading says what is wrong.
+        # `Library.load` raises the error that says what is wrong.
         return (0, 0)
     return (status.st_mtime_ns, status.st_size)
 

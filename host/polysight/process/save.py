@@ -1,6 +1,7 @@
-"""The result of processing as one typed value, and its files.
+"""Collect the result of processing as one value, a `ProcessedScan`, and write it to files.
 
-`collect_processed_scan` makes the value, `save_materials` writes it.
+`collect_processed_scan` and `save_materials` do so for a scan with materials, `collect_imaged_scan` and `save_images`
+for a scan of which only images were made.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Findings:
     Attributes
     ----------
     images
-        Both channels, valid where they were analysed.
+        Images of both channels; a pixel is valid if it was analysed.
     analysis
         Patches and their materials; without names and permittivities if the verdict is "no result".
     verdict
@@ -102,8 +103,8 @@ def collect_imaged_scan(
 ) -> products.ProcessedScan:
     """Return the result of a scan of which only images were made; p is h / v in arbitrary units.
 
-    `rig` is the rig that the images were formed with, `folder` where the data are. `backlash=False` leaves the
-    estimate of the stage's backlash out.
+    `rig` is the rig that the images were formed with, `folder` the folder of the data. With `backlash=False` the
+    stage's backlash is not estimated.
     """
     verdict = join_reasons(recording_verdict(quality))
     return products.ProcessedScan.from_results(
@@ -121,11 +122,11 @@ def collect_processed_scan(
     """Return the result of a scan with its materials; `unnamed` is the reason why nothing was named, or ""."""
     return assemble_result(
         folder,
-        _collect_facts(source, rig, findings.images),
-        quality.result(findings.verdict, pixel_accuracy(findings.analysis)),
-        findings,
-        unnamed,
-        source.plan,
+        facts=_collect_facts(source, rig, findings.images),
+        quality=quality.result(findings.verdict, pixel_accuracy(findings.analysis)),
+        findings=findings,
+        unnamed=unnamed,
+        plan=source.plan,
     )
 
 
@@ -137,9 +138,9 @@ def assemble_result(
     unnamed: str,
     plan: RasterPlan | None = None,
 ) -> products.ProcessedScan:
-    """Return the result with its materials, from findings; parameters as of :func:`collect_processed_scan`.
+    """Return the result with its materials, from findings; `unnamed` is that of :func:`collect_processed_scan`.
 
-    `plan` is the raster of the scan; None for given images.
+    `plan` is the raster of the scan; None if images of another program were processed.
     """
     analysis = findings.analysis
     library = unnamed or "Nothing was named."
@@ -200,13 +201,13 @@ def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsRes
     save_images(out, scan)
     boxes = make_labels(result, f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / products.LABELS, pack_labels(boxes))
-    # `stamped`: the scan is simulated, or it is not known.
+    # `stamped` is true if the scan is simulated, and if it is not known whether it is.
     write_atomically(out / PATCHES_FILE, pack_patches(result, scan.images.x_m, scan.images.y_m, scan.stamped))
     products.write_json(out / products.MATERIALS, scan.materials)
     write_report(out, scan)
     verdict = scan.verdict or Verdict("good")
-    # The terminal shows three reasons, the report all.
-    lines = [*verdict.lines(3), *_summarise_result(scan, result)]
+    # The terminal shows three reasons, the report all of them.
+    lines = [*verdict.lines(max_reasons=3), *_summarise_result(scan, result)]
     if scan.quality.coverage:
         lines += scan.quality.coverage.lines()
     if unnamed:

@@ -13,11 +13,12 @@ from polysight.results.verdict import reason
 from polysight_shared.config import CheckPlate
 from polysight_shared.findings import Finding
 
-# Distances in standard deviations that 95 and 99.7 % of good scans stay below (chi-square of two values).
+# The distance of a good scan, in standard deviations, is below the first limit with 95 % and below the second with
+# 99.7 % probability: square roots of quantiles of chi-squared with two degrees of freedom.
 WARNING_SIGMAS = 2.45
 ACTION_SIGMAS = 3.41
-# Weights of the reasons, which order them: a plate that was measured wrongly says more than one that is missing.
-# Chosen.
+# Weights by which reasons are ordered; chosen. A plate that was measured wrongly is a stronger reason than a missing
+# one.
 _MISSING_WEIGHT = 2.0
 _ACTION_WEIGHT = 3.8
 
@@ -36,7 +37,8 @@ class CheckResult(msgspec.Struct, frozen=True, kw_only=True):
     measured, measured_std
         Permittivity as measured on the patch; None if it is missing.
     sigmas
-        Distance in standard deviations, of both errors and their correlation.
+        Distance of measured and expected permittivity in standard deviations: sqrt(d^T C^-1 d), with their difference d
+        and the sum C of both covariances.
     why
         Why the plate is missing.
     """
@@ -55,7 +57,7 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     """Compare the patch at the place of the check plate with its permittivity; None without a plate in the rig file."""
     if not plate.name:
         return None
-    # The result of a plate that was not measured; it is filled in below.
+    # This is the result for a plate that was not measured.
     missing = CheckResult(name=plate.name, level="missing", expected=plate.permittivity, expected_std=plate.std)
     x_mm, y_mm = plate.place_mm
     patch = next((patch for patch in patches if _contains(patch, x_mm, y_mm)), None)
@@ -65,7 +67,7 @@ def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResu
     if value is None or value.covariance is None:
         return msgspec.structs.replace(missing, why=f"patch {patch.label} there has no permittivity")
     covariance = np.array(value.covariance, np.float64)
-    # The covariance becomes that of (eps', loss): the loss is minus the imaginary part.
+    # Convert the covariance of (real, imaginary part) to that of (eps', loss): the loss is minus the imaginary part.
     covariance[0, 1] *= -1
     covariance[1, 0] *= -1
     total = covariance + np.diag(np.square(plate.std))

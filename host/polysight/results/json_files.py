@@ -74,7 +74,7 @@ def read_object(path: Path) -> dict[str, Any] | None:
 def convert(content: dict[str, Any], kind: type[T], path: Path) -> T:
     """Convert the content of a file to its struct; unknown keys are ignored. Raises DataError."""
     try:
-        # In JSON the keys of objects are text, of numbers too.
+        # The keys of a JSON object are text, also where they stand for numbers.
         return msgspec.convert(content, kind, str_keys=True)
     except msgspec.ValidationError as e:
         raise damage_error(path, str(e)) from None

@@ -1,13 +1,14 @@
-"""Content of materials.json: patches with all their figures, the error budget, and what named the patches.
+"""Content of materials.json: patches with all their figures, the error budget, and the library and model of the names.
 
 The structs are the file format: a field that is UNSET is absent in the file, and unknown keys are ignored.
 
-A figure of a patch is declared once in :class:`PatchFigures`, with a :class:`Column` of its name, unit and title: a
-field whose type carries it, or a figure that `derive` or `derive_if_known` computes from fields. Tables, exports,
-datasets and pages render all columns, in the order of declaration.
+A figure of a patch is declared once in :class:`PatchFigures`, together with a :class:`Column`, which has its name, unit
+and title. A figure is either a field, with the column in its annotation, or is computed from fields by `derive` or
+`derive_if_known`. Tables, exports, datasets and pages render all columns, in the order of declaration.
 """
 
-# Annotations are evaluated where they stand: columns have the order of the declarations.
+# Without `from __future__ import annotations`, Python evaluates each annotation at its declaration: a column gets its
+# position there.
 
 import cmath
 import math
@@ -32,7 +33,7 @@ Pair = tuple[float | None, float | None]
 Number = float | None
 Text = str | None
 V = TypeVar("V")
-# Numbers the columns in the order of their declarations.
+# Counts the columns in the order of their declarations.
 _positions = count()
 
 
@@ -55,7 +56,7 @@ class Column:
     optional
         True if datasets omit the figure when no patch has a value.
     position
-        Place in the order of the declarations, set by itself.
+        Place in the order of the declarations; it is counted and need not be given.
     """
 
     name: str
@@ -144,7 +145,8 @@ def derive_if_known(
 ) -> Derived[V | None]:
     """Declare a figure that some patches lack.
 
-    `source` computes it, or is a path of attributes ("permittivity.real"); it is None if an attribute on the path is.
+    `source` is a function of the patch, or a path of attributes ("permittivity.real"). The figure is None if an
+    attribute on the path is None or UNSET.
     """
     if isinstance(source, str):
         return Derived(kind, partial(_follow, source.split(".")), column)
@@ -152,7 +154,7 @@ def derive_if_known(
 
 
 def _follow(path: Sequence[str], value: Any) -> Any:
-    """Return the attribute of an attribute ... of `value`; None if one of them is None or UNSET."""
+    """Follow a path of attributes from `value` and return the last one; None if one of them is None or UNSET."""
     for name in path:
         value = getattr(value, name)
         if value is None or value is UNSET:
@@ -224,11 +226,11 @@ class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
     real_std, imag_std
         Standard errors: 1.96 of them hold 95 %.
     half_widths_68
-        Half widths of the intervals about `real` and `imag` that hold 68 %: the tails of the errors are heavier than a
-        normal distribution's, so that they are mostly smaller than the standard errors. None in products of old
-        releases.
+        Half widths of the intervals about `real` and `imag` that hold 68 %. They are mostly smaller than the standard
+        errors, because the errors have heavier tails than a normal distribution. None in products of old releases.
     covariance
-        [2][2] of (`real`, `imag`). With the loss, the mixed term changes its sign.
+        [2][2] of (`real`, `imag`). Since the loss is -`imag`, the covariance of `real` and the loss is minus the mixed
+        term.
     shares, dominated_by
         Share of each source in the variance, and the largest source.
     do
@@ -266,7 +268,8 @@ class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
             mixed = covariance[0][1]
             imag = covariance[1][1]
             if real is not None and mixed is not None and imag is not None:
-                return PermittivitySpread(math.sqrt(real), math.sqrt(imag), -mixed + 0.0)
+                # Adding zero removes the sign of a negative zero.
+                return PermittivitySpread(math.sqrt(real), math.sqrt(imag), covariance=-mixed + 0.0)
         if self.real_std is None or self.imag_std is None:
             return None
         return PermittivitySpread(self.real_std, self.imag_std)
@@ -315,7 +318,7 @@ class BandFigures(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TruthFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """The plate of a simulated scene; `in_library`: the library holds its material."""
+    """The true plate of a simulated scene; `in_library` says if the library contains its material."""
 
     name: str
     metal: bool = False
@@ -324,8 +327,13 @@ class TruthFigures(msgspec.Struct, frozen=True, kw_only=True):
     in_library: bool = True
 
 
+# Index of a part of the permittivity in `half_widths_68`. The half width of the loss is that of the imaginary part.
+_REAL = 0
+_LOSS = 1
+
+
 def _half_width_68(patch: "PatchFigures", part: int) -> float | None:
-    """Return the half width of the real part (0) or of the loss (1); None if it is not known."""
+    """Return the half width of a part, `_REAL` or `_LOSS`; None if it is not known."""
     if patch.permittivity is None or patch.permittivity.half_widths_68 is None:
         return None
     return patch.permittivity.half_widths_68[part]
@@ -351,7 +359,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     box_mm
         Bounding box: least x and y, largest x and y.
     outline_mm, pixels
-        Outline and size before edges are left out.
+        Outline of the patch and its number of pixels, with the edges that are left out of the other figures.
     amplitude_h
         Median of abs(H) relative to metal.
     refused
@@ -421,11 +429,11 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
         Column("permittivity_real_loss_covariance", "covariance of the permittivity's real part and loss"),
     )  # fmt: skip
     permittivity_real_half_width_68 = derive_if_known(
-        float, lambda patch: _half_width_68(patch, 0),
+        float, lambda patch: _half_width_68(patch, _REAL),
         Column("permittivity_real_half_width_68", "half width of the interval of 68 %, real part"),
     )  # fmt: skip
     permittivity_loss_half_width_68 = derive_if_known(
-        float, lambda patch: _half_width_68(patch, 1),
+        float, lambda patch: _half_width_68(patch, _LOSS),
         Column("permittivity_loss_half_width_68", "half width of the interval of 68 %, loss"),
     )  # fmt: skip
     dominated_by = derive_if_known(
@@ -495,7 +503,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     def without_results(self) -> Self:
         """Return the patch without names, ratios, permittivity and truth.
 
-        Place, size, incidence, tilt, the mark of the metal reference and the refusal stay.
+        Place, size, incidence, tilt, the mark of the metal reference and the reason of a refusal are kept.
         """
         return msgspec.structs.replace(
             self, name=None, name_source=None, confidence=None, votes={}, probabilities={}, literature={}, why="",
@@ -531,7 +539,7 @@ class IncidenceError(msgspec.Struct, frozen=True, kw_only=True):
 class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
     """Plane of the plates relative to the plane of the rig file; without values if `known` is False.
 
-    It was found `by` the "phase" or the "range" of so many `plates`.
+    `by` is "phase" or "range", the quantity from which it was found; `plates` is the number of plates that were used.
     """
 
     known: bool = False
@@ -548,7 +556,7 @@ class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
 class MetalScore(msgspec.Struct, frozen=True, kw_only=True):
     """Evidence that the reference is metal.
 
-    `score` is ln of the evidence for metal over that for a dielectric, by the other patches, `others` in number;
+    `score` is ln(evidence for metal / evidence for a dielectric) from the other patches, of which there are `others`;
     `channel_ratio_db` is V / H relative to the direct path. `painted` is the probability that the metal is painted,
     `paint_mm` the thickness of the paint in that case.
     """

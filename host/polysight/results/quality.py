@@ -75,11 +75,12 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
     bytes_missing
         Bytes of the raw data that never came.
     chirps_clipped, chirps_disturbed
-        Received chirps left out: clipped by the receiver; unlike the others of their burst (another radar, silence).
+        Numbers of received chirps that were left out: because the receiver clipped them, and because they differ from
+        the others of their burst (another radar, or silence).
     positions_clipped
         Masked positions of which all chirps were clipped.
     dead_rx
-        RX that gave no signal, counted from 1, to the rows; they were left out of the images there.
+        Number of an RX, from 1, to the rows in which it gave no signal and was left out of the images.
     rx_order
         Places in the rig file of the recorded RX, counted from 1, if they were recorded in another order; else empty.
     phase_jumps
@@ -94,7 +95,7 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
         Stage to its residuals.
     """
 
-    # Counted in chirps; most frames hold one. `frames_masked` were not received whole.
+    # Numbers of frames, which are counted in chirps: most frames hold one. `frames_masked` were received incompletely.
     frames_expected: int = 0
     frames_received: int = 0
     bytes_missing: int = 0
@@ -109,7 +110,7 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
     rx_order: list[int] = []
     phase_jumps: list[PhaseJump] = []
     direct_path_hz: FrequencyRange | UnsetType = UNSET
-    # In one sample of one chirp; None where the noise is unknown.
+    # Power of the direct path over noise in one sample of one chirp; None if the noise is unknown.
     direct_path_snr_db: float | None = None
     # Shift of odd rows towards +x, from echoes; None if undetermined.
     stage_backlash_mm: Backlash | None = None
@@ -122,8 +123,8 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
 class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
     """Aperture of one receiver and its response to a point in the middle of the image, for (x, y).
 
-    `masked` is the share of the tapered aperture without data, `loss_db` how much weaker the sum of a point's echoes is
-    due to it; `frequencies` the number of samples of a position after the range gate.
+    `masked` is the share of the tapered aperture without data, and `loss_db` the loss of the sum of a point's echoes
+    that results from it. `frequencies` is the number of samples of a position after the range gate.
     """
 
     positions: int = 0

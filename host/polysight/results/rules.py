@@ -25,7 +25,7 @@ SOME_CHIRPS = 0.05
 """Share of chirps left out as clipped or disturbed above which the result needs care."""
 RECONSTRUCTION_NONE = 0.15
 """Expected error of an image with reconstructed positions, above which there is no result. True errors of points stay
-below twice the expected ones (tests/imaging/test_sparse.py); of nine simulated plates they were 0.1 to 1.2 times."""
+below twice the expected ones (tests/imaging/test_sparse.py); those of nine simulated plates were 0.1 to 1.2 times."""
 DIRECT_SNR_NONE_DB = -14.0
 """Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
 DIRECT_SNR_CARE_DB = 0.0
@@ -51,12 +51,13 @@ limit."""
 HALO_CARE = 0.005
 """Halo of V around the metal above which a receiver is overdriven."""
 BACKGROUND_CARE = 0.04
-"""Error of P by what lies behind the plates: about 3 % of a permittivity."""
+"""Error of P by objects behind the plates above which the result needs care: about 3 % of a permittivity."""
 RIPPLE_CARE = 0.03
 """Scatter of V / H inside plates above which the result needs care; undisturbed scenes have up to 0.012."""
 DISTURBED_CARE = 0.025
-"""Error of a permittivity by slopes of V / H that a plate has of its own, above which it is named. In 40 undisturbed
-scenes of the independent generator it is 0.009 at most, above 0.025 in nine of twelve with a second path."""
+"""Error of a permittivity by slopes of V / H within its own plate, above which the verdict reports the plate. In 40
+undisturbed scenes of the independent generator it is 0.009 at most, above 0.025 in nine of twelve with a second
+path."""
 FRINGES_CARE = 0.5
 """Probability of fringes above which they are reported: undisturbed scenes have less than 0.01."""
 MOVED_CARE = 0.9
@@ -80,7 +81,7 @@ pictures)."""
 
 
 RECONSTRUCT = "`polysight process SCAN --sparse --out DIR` reconstructs them"
-"""Advice where positions have no data: separate plates are then as in a whole scan, but for a small, stated error."""
+"""Advice for positions without data. Images of separate plates then have a small error, which is stated."""
 
 
 def judge_recording(coverage: Coverage, masked_share: float = 0.0, is_filled: bool = False) -> list[Finding]:
@@ -88,7 +89,7 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0, is_filled: bo
 
     `is_filled`: the positions without data were reconstructed.
     """
-    # Of many missing positions a reconstruction is mostly invented.
+    # A reconstruction is not advised at the level "none": of so many missing positions it would be mostly invented.
     advice = {"care": "" if is_filled else f"; {RECONSTRUCT}", "none": ""}
     reasons = []
     if coverage.rows_planned:
@@ -111,7 +112,7 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0, is_filled: bo
         frames_absent = 1 - coverage.frames_received / coverage.frames_planned
     else:
         frames_absent = 1.0
-    # Frames of absent rows are absent, too: those were judged above.
+    # The frames of absent rows are subtracted: these rows were judged above.
     lost_share = max(masked_share, frames_absent - rows_absent)
     if lost_share > SOME_POSITIONS:
         level = "none" if lost_share > FEW_POSITIONS else "care"
@@ -164,8 +165,12 @@ def judge_left_out_chirps(board: str, clipped: float, disturbed: float, position
 
 
 def judge_dead_rx(board: str, dead: Mapping[int, Sequence[int]], rows: int) -> list[Finding]:
-    """Judge a board's RX without a signal: number to the rows, of its recorded `rows`, in which it gave none."""
+    """Judge a board's RX without a signal: `dead` maps their numbers to the rows in which they gave none.
+
+    `rows` is the number of rows that the board recorded.
+    """
     reasons = []
+    # RX that gave no signal in the same rows are reported together.
     for dead_rows in dict.fromkeys(tuple(value) for value in dead.values()):
         names = [f"RX{rx}" for rx, value in dead.items() if tuple(value) == dead_rows]
         some = ""
@@ -306,9 +311,10 @@ def judge_metal(
 ) -> list[Finding]:
     """Judge the metal reference `patch` ("patch 3").
 
-    By the other patches it is `is_likely` or `is_certain` to be metal; `contradicted`: by its own V / H against the
-    direct path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against
-    it. `is_given`: the user chose it. `painted` is the probability that it is metal with a coating, `paint_mm` thick.
+    `is_likely` and `is_certain` say if the other patches show that it is metal, `contradicted` if its own V / H against
+    the direct path shows that it is not. With `only_patch` there are no others. `culprit` is the patch that fits the
+    reference least, if patches speak against it. `is_given`: the user chose the reference. `painted` is the probability
+    that it is metal with a coating, which is `paint_mm` thick.
     """
     do = "lay a metal plate into the scene and name it (--metal-box X0,Y0,X1,Y1), or use `polysight calibrate metal`"
     if is_given and contradicted:
@@ -317,7 +323,8 @@ def judge_metal(
             f"the given metal reference ({patch}) does not look like metal",
             "relative to the direct path it reflects less of V than of H; no metal does this", do, weight=8.0,
         )]  # fmt: skip
-    # Before paint: where other patches speak against the metal, a dielectric explains them better than a coating does.
+    # This comes before paint: if other patches speak against the metal, a dielectric explains them better than a
+    # coating.
     if is_given and culprit is not None and not is_likely:
         return [reason(
             "care",
@@ -365,7 +372,7 @@ def judge_dark_reference(patch: str, brightest: int, brighter_db: float) -> list
 
 
 def judge_leakage(measured: bool, estimated: bool, relative_error: float) -> list[Finding]:
-    """Judge leakage that was not measured, only `estimated` from the scene or neither.
+    """Judge leakage that was not `measured`: it was `estimated` from the scene, or is not known.
 
     `relative_error` is its median effect on the permittivities.
     """
@@ -429,7 +436,7 @@ def judge_plane(
 def judge_copies(
     labels: Sequence[int], shift_mm: tuple[float, float], level_db: float, has_gaps: bool = False
 ) -> list[Finding]:
-    """Judge patches that are shifted, weaker copies of the plates; none without `labels`.
+    """Judge patches, with these `labels`, that are shifted and weaker copies of the plates.
 
     `has_gaps`: positions have no data, and were not reconstructed.
     """
@@ -482,7 +489,8 @@ def judge_drift(amplitude: float, phase_rad: float, probability: float) -> list[
 def judge_fringes(probability: float, has_gaps: bool = False, behind: float = 0.0) -> list[Finding]:
     """Judge fringes of a second path, by their probability; `has_gaps` as in :func:`judge_copies`.
 
-    `behind` is what :func:`judge_background` judges: where it disturbs V / H, it makes the fringes.
+    `behind` is the error by objects behind the plates, as in :func:`judge_background`; a large one explains the
+    fringes.
     """
     if not is_known(probability) or probability <= FRINGES_CARE:
         return []
@@ -576,7 +584,8 @@ def judge_background(relative_std: float) -> list[Finding]:
 def judge_flatness(
     ripple: tuple[float, float], relief_rad: float, is_boxed: bool = False, has_gaps: bool = False
 ) -> list[Finding]:
-    """Judge how well flat plates fit: usual scatter of ln|V / H| and of its phase inside them, and their relief.
+    """Judge how well flat plates fit: `ripple` is the usual scatter of ln|V / H| and of its phase inside plates,
+    `relief_rad` that of the phase of H.
 
     A flat plate has one V / H, and a phase of H that is a plane. `is_boxed`: the plates' boxes were given; boxes
     that reach within 3 mm of the plates' edges add the edges' ripple. `has_gaps` as in :func:`judge_copies`.

@@ -29,7 +29,7 @@ class NoResult(PolysightError):  # noqa: N818 (a result that ends a command like
 
 
 def is_known(value: float | None) -> TypeGuard[float]:
-    """True for a finite number: one that is nan or inf is not known, and never shown."""
+    """True for a finite number. Numbers that are nan or inf count as unknown, and are never shown."""
     return value is not None and bool(np.isfinite(value))
 
 

@@ -61,7 +61,9 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(undisturbed_images, tm
         RIG, scene, tmp_path, layout="authors", by_columns=True, zero_filling=False, skipped={("RV", 3): {0, 7}}
     )
     image, pipeline = read_images(folder)
-    assert image.h.shape == undisturbed_images.h.shape == (50, 60)
+    small_image = RIG_WITH_SMALL_IMAGE.image
+    assert image.h.shape == (small_image.rows, small_image.columns)
+    assert undisturbed_images.h.shape == image.h.shape
     np.testing.assert_allclose(image.x_m, undisturbed_images.x_m, atol=1e-12)
     np.testing.assert_allclose(image.y_m, undisturbed_images.y_m, atol=1e-12)
     # Noise, the disturbances and lost packets leave a correlation of 0.992 and 0.997.
@@ -128,7 +130,7 @@ def test_cubes_are_processed_like_any_scan_but_have_no_sync_report(tmp_path):
     assert main(["process", str(folder), "--out", str(tmp_path / "out"), "--config", str(config)]) == 0
     assert len(json.loads((tmp_path / "out" / "materials.json").read_text())["segments"]) == 2
     quality = json.loads((tmp_path / "out" / "quality.json").read_text())
-    assert quality["boards"]["RH"]["positions"] == 17 * 21
+    assert quality["boards"]["RH"]["positions"] == SCENE["grid"]["columns"] * SCENE["grid"]["rows"]
     assert set(quality["recording"]["cubes"]) == {"RH", "RV"}
     status = main(["sync-report", str(folder), "--out", str(tmp_path / "sync"), "--config", str(config)])
     assert status == DataError.exit_status

@@ -104,7 +104,7 @@ def test_lost_positions_of_odd_rows_are_counted_by_column(make_scan, tmp_path):
         expected[index, columns] = True
     empty_image = np.zeros((1, 1), np.complex64)
     axis = np.zeros(1)
-    images = Images(empty_image, empty_image, axis, axis, empty_image.astype(bool), empty_image)
+    images = Images(h=empty_image, v=empty_image, x_m=axis, y_m=axis, valid=empty_image.astype(bool), p=empty_image)
     scan = ProcessedScan.from_results(Path(), images=images, quality=quality, facts=ScanFacts(), plan=source.plan)
     for masked in find_masked_positions(scan).values():
         np.testing.assert_array_equal(masked, expected)

@@ -24,6 +24,8 @@ from polysight_simulators.scene import decode_scene
 
 # Squared distance of a true permittivity from its estimate that is three standard deviations
 THREE_STDS_SQUARED = 3.0**2
+# More rows than the scan has
+ALL_ROWS = range(1000)
 
 
 def draw_noise(row: int, words: np.ndarray, rms: float) -> np.ndarray:
@@ -38,7 +40,7 @@ def kill(
     board: str,
     *rx: int,
     rms: float = 6.0,
-    rows: range = range(1000),
+    rows: range = ALL_ROWS,
     value: int | None = None,
     positions: slice = slice(None),
 ) -> Mangle:
@@ -137,8 +139,9 @@ def test_the_images_are_those_of_a_rig_without_the_rx(source):
 
         def read_row(self, board: str, row: int) -> RowData | CubeRow:
             recorded = source.read_row(board, row)
-            words = recorded.payload.view(np.int16).reshape(-1, 4)[:, [0, 1, 3]]
-            return replace(recorded, pieces=split_pieces(np.ascontiguousarray(words).reshape(-1).view(np.uint8)))
+            words = recorded.payload.view(np.int16).reshape(-1, 4)
+            words_without_rx3 = np.ascontiguousarray(np.delete(words, 2, axis=1))
+            return replace(recorded, pieces=split_pieces(words_without_rx3.reshape(-1).view(np.uint8)))
 
     def kill_rx3(name: str, row: int, words: np.ndarray) -> None:
         """Kill RX3 of any board."""

@@ -14,7 +14,7 @@ from polysight_shared.errors import DataError
 from polysight_shared.files import read_json
 
 PLATE = {"name": "PET", "centre_mm": [0, 0], "size_mm": [30, 30], "permittivity": [3.0, 0.1]}
-# Name of the case to the content of truth.json.
+# Contents of truth.json by the name of the case
 FOREIGN = {
     "other keys": b'{"answer": 42}',
     "not JSON": b"the plate is copper\n",

@@ -102,8 +102,9 @@ def test_permittivities_are_those_of_the_plates(labels_folder, rig):
         if estimate is not None:
             true = MATERIALS[segment.box].permittivity
             error = abs(complex(estimate.real, estimate.imag) - true)
-            # Wrong by a fifth is another material; and three standard deviations of both parts together.
+            # An error of a fifth would make it another material.
             assert error < 0.2 * abs(true)
+            # The error of both parts together is within three standard deviations.
             assert error < 3 * np.hypot(estimate.real_std, estimate.imag_std)
 
 
@@ -182,7 +183,7 @@ def test_pixels_marked_invalid_are_left_out(save_images, pair, rig):
     assert not scan.images.valid[80:].any()
 
 
-# Name of the case to changed arrays, the code of the refusal, and a text in it.
+# By the name of the case: changed arrays, the code of the refusal, and a text in it
 WRONG = {
     "no v": ({"v": None, "sar_v": np.ones(3)}, ErrorCode.KEY_MISSING, "sar_v"),
     "magnitude": ({"h": np.ones((150, 150))}, ErrorCode.TYPE_WRONG, "float64"),
@@ -295,7 +296,7 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
     ]
     # At least three of the five plates have a tilt in both results.
     assert len(changes) >= 3
-    # A sixteenth of the tilt
+    # The limit is a sixteenth of the tilt.
     assert np.median(changes) == pytest.approx(degrees[1], abs=0.05)
 
 

@@ -248,8 +248,9 @@ def test_layers_of_six_plates_next_to_each_other_are_recovered_with_the_metal_am
     """Plates of 72 x 78 mm have edges and neighbours, and their metal reference is in the same scene."""
     if not pytestconfig.getoption("--long"):
         pytest.skip("half a minute: --long")
-    for i, plate in enumerate(SIX):
-        plate.update(centre_mm=[(i % 3 - 1) * 90.0, (0.5 - i // 3) * 95.0], size_mm=[72.0, 78.0])
+    centres_mm = [[x_mm, y_mm] for y_mm in (47.5, -47.5) for x_mm in (-90.0, 0.0, 90.0)]
+    for plate, centre_mm in zip(SIX, centres_mm, strict=True):
+        plate.update(centre_mm=centre_mm, size_mm=[72.0, 78.0])
     grid = {"columns": 55, "rows": 55, "step_x_mm": 10.0, "step_y_mm": 6.0}
     raw = {
         "name": "six",

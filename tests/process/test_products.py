@@ -134,7 +134,9 @@ def test_products_that_lack_rows_recorded_in_the_meantime_do_not_replace_those_o
 ) -> None:
     resumed = Path(shutil.copytree(scan, tmp_path / "scan"))
     manifest = (resumed / MANIFEST).read_bytes()
-    unfinished = b"".join(line for line in manifest.splitlines(keepends=True)[:-3])
+    # Without its last three lines the manifest lacks at least one committed row.
+    lines = manifest.splitlines(keepends=True)
+    unfinished = b"".join(lines[:-3])
     assert unfinished.count(b"row_committed") < manifest.count(b"row_committed")
     (resumed / MANIFEST).write_bytes(unfinished)
     add_rows = process.add_rows

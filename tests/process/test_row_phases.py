@@ -18,7 +18,8 @@ from polysight_worlds import METAL, Plate, Stack, World, published_rig as indepe
 from polysight_worlds.world import nine_places
 
 EMPTY: dict[str, Any] = SCENE | {"plates": []}
-# Distance of the rows of these tests along y; those of the independent generator are 2 mm apart.
+# Distance along y of the rows of the independent generator, and of those that are interpolated between them
+FINE_STEP_MM = 2.0
 STEP_MM = 4.0
 Echoes = dict[int, np.ndarray]
 
@@ -43,7 +44,7 @@ def fine_rows() -> list[np.ndarray]:
 
 def displace(fine: np.ndarray, shifts_mm: np.ndarray) -> Echoes:
     """Return rows 4 mm apart, each as recorded at its displaced place: interpolated by the spectrum along y."""
-    frequencies = np.fft.fftfreq(len(fine), 2.0)
+    frequencies = np.fft.fftfreq(len(fine), FINE_STEP_MM)
     spectrum = np.fft.fft(fine, axis=0)
     rows = {}
     for number in range(len(fine) // 2):

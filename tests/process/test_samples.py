@@ -26,7 +26,11 @@ from polysight.store.manifest import encode_line
 from polysight.store.source import split_pieces
 from polysight_shared.errors import DataError, ErrorCode
 
+# Arrays of `Images`
 PIXELS = ("h", "v", "h_raw", "v_raw", "valid")
+# Rows and RX of the scan `two_plates`
+ROWS = 17
+RX = 4
 
 
 def process_scan(folder: Path, samples: SampleUse = "keep", **settings: Any) -> Pipeline:
@@ -168,6 +172,7 @@ def test_damaged_samples_are_made_again(expected_images: Images, scan_with_sampl
     folder = scan_with_samples / "samples"
     rows = folder / "rows.jsonl"
     array = folder / "RH.npy"
+    # Each number of bytes lies within the last record or the last line.
     if what == "record":
         data = bytearray(array.read_bytes())
         data[-5000] ^= 1
@@ -226,9 +231,9 @@ def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, scan_
     lines = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
     # complex64 [row, rx, frequency, column]
     cube = records["samples"]
-    assert cube.shape[:2] == (17, 4)
+    assert cube.shape[:2] == (ROWS, RX)
     assert cube.shape[2] == len(head["frequencies_hz"]["samples"])
-    assert [line["row"] for line in lines] == list(range(17))
+    assert [line["row"] for line in lines] == list(range(ROWS))
     np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), from_raw.builder.boards["RH"]._cube)
 
 

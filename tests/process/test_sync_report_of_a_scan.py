@@ -35,7 +35,7 @@ def scan(make_scan, tmp_path_factory):
         chirps=640,
         residual_db=0.05,
     )
-    head = make_header("hpf", [SourceScan("sweep", "sweep", True, 3)])
+    head = make_header("hpf", [SourceScan("sweep", "sweep", simulated=True, rows=3)])
     path = write_calibration(FilterFile(**head, boards={"RH": true_filter, "RV": true_filter}), folder / "calibration")
     true_rig = make_rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     scene_changes = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
@@ -81,10 +81,11 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
         two_boards_hz = slope * SYNC_NS * 1e-9 * np.sqrt(2 / 12)
         assert stages["received"]["frequency_hz_std"] == pytest.approx(two_boards_hz, rel=0.15)
         assert stages["received"]["phase_rad_std"] == pytest.approx(np.pi / np.sqrt(3), rel=0.15)
-        # What is left is noise, once the filter's true response is taken out: its slope would turn frequency into
-        # amplitude.
+        # Only noise is left if the filter's true response was removed. Otherwise the slope of the response would turn
+        # the random frequencies into random amplitudes.
         for stage in ("aligned", "averaged", "referenced"):
             figures_of_stage = stages[stage]
+            # Measured: amplitudes of 0.0014 to 0.0025, and phases of up to 1.3 times their bound of 0.0015 to 0.0043.
             assert figures_of_stage["amplitude_std"] < 0.004
             assert figures_of_stage["phase_rad_std"] < 1.5 * figures_of_stage["phase_rad_bound"]
             assert 1.5 * figures_of_stage["phase_rad_bound"] < 0.01

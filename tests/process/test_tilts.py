@@ -16,6 +16,8 @@ from polysight.materials.segment import Segmentation, box_mask, make_patch
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_simulators.scene import decode_scene
 
+# Growth of the phase along a plate with a rise of 1, radians per metre; about as on the published rig
+PHASE_RAD_PER_M = 1900.0
 # Centres of six plates in millimetres, and their tilts along x and y.
 PLACES = [(-60.0, 40.0), (0.0, 40.0), (60.0, 40.0), (-60.0, -40.0), (0.0, -40.0), (60.0, -40.0)]
 TILTS_DEG = [(0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-0.7, 0.7), (0.5, -1.0)]
@@ -81,7 +83,7 @@ def _turn_polarisation():
 def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
     images = tilted_images[0]
     rises = [images.illumination.estimate_rise(images.h, images.v, mask) for mask in _make_inside_masks(images)]
-    # To about a tenth of a degree, also of the level plate
+    # Tilts are found to about a tenth of a degree, that of the level plate, too.
     assert np.degrees(rises) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
 
 
@@ -155,29 +157,32 @@ def test_tilts_of_a_transposed_image_are_those_of_the_image_with_axes_exchanged(
 def make_illumination(footprints):
     """Return an illumination with these footprints [2, ny, nx] of both channels and pixels of 2 mm.
 
-    For a rise of 1 the phase grows by 1900 radians per metre, about as on the rig, and specular points move by 1 m.
+    For a rise of 1 the phase grows by PHASE_RAD_PER_M, and specular points move by 1 m.
     """
-    return Illumination(footprints, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+    moves_m = np.stack([np.eye(2)] * 2)
+    phases_rad_per_m = np.array([PHASE_RAD_PER_M, PHASE_RAD_PER_M])
+    pixel_m = (2e-3, 2e-3)
+    return Illumination(footprints, moves_m, phases_rad_per_m, pixel_m)
 
 
 def test_noise_gives_no_tilt_and_steep_phases_are_reported():
     rng = np.random.default_rng(1)
-    lit = make_illumination(np.ones((2, 40, 40), np.complex64))
+    illumination = make_illumination(np.ones((2, 40, 40), np.complex64))
     mask = np.ones((40, 40), bool)
     noise = rng.standard_normal((40, 80)).view(np.complex128)
-    assert lit.estimate_rise(noise, noise, mask) == (0.0, 0.0)
+    assert illumination.estimate_rise(noise, noise, mask) == (0.0, 0.0)
     # Rises of a tilt that is usual, and of one that is too steep
     for slope in (0.02, 0.08):
-        along = np.exp(-1j * slope * 1900 * 2e-3 * np.arange(40))
+        along = np.exp(-1j * slope * PHASE_RAD_PER_M * 2e-3 * np.arange(40))
         image = np.tile(along, (40, 1)).astype(np.complex128)
-        assert lit.estimate_rise(image, image, mask) == pytest.approx((slope, 0.0))
+        assert illumination.estimate_rise(image, image, mask) == pytest.approx((slope, 0.0))
 
 
 def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
     footprints = np.ones((2, 20, 20), np.complex64)
     footprints[:, :, 10:] = 0
-    lit = make_illumination(footprints)
-    factors = lit.to_level(np.ones((20, 20), bool), (0.02, 0.0))
+    illumination = make_illumination(footprints)
+    factors = illumination.to_level(np.ones((20, 20), bool), (0.02, 0.0))
     assert np.isfinite(factors).all()
     # A division by the dark pixels would give 0 or infinity.
     assert factors.min() > 0.5
@@ -205,24 +210,24 @@ def test_a_dim_steep_patch_at_the_end_of_the_scan_is_a_smear(level_h, level_v, r
     second_plate = np.zeros((100, 100), bool)
     second_plate[row : row + 18, 30:50] = True
     # The second patch has a rise of 0.1 along x: steeper than any plate's tilt (0.06).
-    steep = second_plate * np.exp(-1j * 0.1 * 1900 * axis_m)
+    steep = second_plate * np.exp(-1j * 0.1 * PHASE_RAD_PER_M * axis_m)
     h = (plate + level_h * steep).astype(np.complex64)
     v = (plate + level_v * steep).astype(np.complex64)
     images = Images(h, v, axis_m, axis_m, usable)
-    lit = make_illumination(np.ones((2, 100, 100), np.complex64))
+    illumination = make_illumination(np.ones((2, 100, 100), np.complex64))
     patches = tuple(make_patch(i, mask, axis_m, axis_m, 5.0, usable) for i, mask in ((1, plate), (2, second_plate)))
-    tilts = Tilts.estimate(images, lit, Segmentation(plate + 2 * second_plate.astype(np.int32), patches))
+    tilts = Tilts.estimate(images, illumination, Segmentation(plate + 2 * second_plate.astype(np.int32), patches))
     assert tilts.refusals() == {2: refused}
 
 
 @pytest.mark.parametrize("radius_m", [0.1, 0.3, np.inf])
 def test_the_curvature_of_a_patch_is_estimated_from_its_phase(radius_m):
-    lit = make_illumination(np.ones((2, 24, 24), np.complex64))
+    illumination = make_illumination(np.ones((2, 24, 24), np.complex64))
     x_m = (np.arange(24) - 11.5) * 2e-3
     height_m = 0.01 * x_m + x_m**2 / (2 * radius_m)
     noise = np.random.default_rng(1).standard_normal((24, 48)).view(np.complex128)
-    image = np.tile(np.exp(-1j * 1900.0 * height_m), (24, 1)) + 0.05 * noise
-    along_x, along_y = lit.estimate_bend(image, image, np.ones((24, 24), bool))
+    image = np.tile(np.exp(-1j * PHASE_RAD_PER_M * height_m), (24, 1)) + 0.05 * noise
+    along_x, along_y = illumination.estimate_bend(image, image, np.ones((24, 24), bool))
     # Curvatures, 1 / m, of 10, 3.3 and 0 are told apart with noise of 5 %.
     assert along_x == pytest.approx(1 / radius_m, abs=0.2)
     assert along_y == pytest.approx(0.0, abs=0.2)

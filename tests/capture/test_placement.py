@@ -1,5 +1,10 @@
-"""Placement of packets by byte count: data is original or masked, and the mask equals what was lost."""
+"""Placement of packets in a row by the card's counters: bytes are as sent or masked, and only lost bytes are masked.
 
+A *record* is what a card sends of one row. The counters in a packet are the number of bytes before it and the packet's
+sequence number. A row is *located* if the place of every byte is certain; otherwise all of it is masked.
+"""
+
+import math
 import random
 import sys
 from dataclasses import dataclass
@@ -9,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings, strategies as st
 from tests.support.capture.records import (
     FULL,
+    HEADER_BYTES,
     Card,
     Record,
     encode_packet,
@@ -21,12 +27,15 @@ from tests.support.capture.records import (
 )
 
 from polysight.capture.dca1000 import Counters, PacketLog
-from polysight.capture.placement import EarlierRecords, Evidence, Losses, place_record
+from polysight.capture.placement import EarlierRecords, Evidence, Losses, PlacedRecord, place_record
 from polysight.capture.row_files import read_packets, write_packets
 
+# Bytes of a frame
+FRAME = 4096
 # A busy machine is not a fault.
 SLOW = [HealthCheck.too_slow]
-# Byte counts have 48 bits and sequence numbers 32, and begin again at 0 after them. Those drawn are often just before.
+# Numbers of values of a byte count (48 bits) and of a sequence number (32 bits); after the largest they begin at 0.
+# The last branch of each strategy draws counters that begin again within some 30 full packets.
 COUNT = 1 << 48
 SEQUENCE = 1 << 32
 near_wrap = st.one_of(st.just(0), st.integers(0, COUNT - 1), st.integers(COUNT - 40_000, COUNT - 1))
@@ -46,39 +55,45 @@ near_sequence_wrap = st.one_of(st.integers(0, SEQUENCE - 1), st.integers(SEQUENC
 def test_of_disordered_packets_exactly_the_lost_are_masked(
     frame, frames, count, sequence, batch, rng: random.Random, rate
 ):
-    """Start known. Unmasked bytes are original; where the record's place is certain, the mask is exactly the loss."""
+    """The start of the record is known. `rate` is the share of packets that are lost, doubled or displaced."""
     record = Record.make(frame * frames, count, sequence)
     sent = [(k, packet) for k, packet in enumerate(record.packets) if rng.random() >= rate]
     sent += [numbered for numbered in sent if rng.random() < rate]
 
     def draw_place(numbered: tuple[int, bytes]) -> int:
         """Draw when a packet comes: at its place, or up to three places before or after it."""
+        number, _ = numbered
         if rng.random() < rate:
-            return numbered[0] + rng.randint(-3, 3)
-        return numbered[0]
+            return number + rng.randint(-3, 3)
+        return number
 
     order = sorted(sent, key=draw_place)
     placed, out = place(len(record.data), [packet for _, packet in order], Counters(count, sequence), frame, batch)
     assert is_original_or_masked(record, placed, out)
     received = {k for k, _ in sent}
-    lost_bytes = make_mask(out.size, [record.byte_range(k) for k in range(len(record.packets)) if k not in received])
+    lost = [k for k in range(len(record.packets)) if k not in received]
+    lost_bytes = make_mask(out.size, [record.byte_range(k) for k in lost])
     assert placed.received == (~lost_bytes).sum()
     assert placed.counts.placed == len(received)
     assert placed.counts.duplicates == len(sent) - len(received)
-    assert placed.counts.outside == placed.counts.disagreeing == placed.counts.malformed == 0
+    assert placed.counts.outside == 0
+    assert placed.counts.disagreeing == 0
+    assert placed.counts.malformed == 0
     mask = make_mask(out.size, placed.missing)
-    assert (mask | ~lost_bytes).all()
-    # With its last packet the length of the record is known.
-    if len(record.packets) - 1 in received:
+    assert mask[lost_bytes].all()
+    # If the last packet came, the length of the record is known.
+    last_packet = len(record.packets) - 1
+    if last_packet in received:
         assert placed.located
     if placed.located:
         assert (mask == lost_bytes).all()
         assert not out[mask].any()
     else:
         assert mask.all()
-    if placed.located and (start := find_next_start(placed)) is not None:
-        assert start.byte_count == (count + len(record.data)) % COUNT
-        assert start.sequence == (sequence + len(record.packets)) % SEQUENCE
+    next_start = find_next_start(placed)
+    if placed.located and next_start is not None:
+        assert next_start.byte_count == (count + len(record.data)) % COUNT
+        assert next_start.sequence == (sequence + len(record.packets)) % SEQUENCE
 
 
 @dataclass
@@ -96,7 +111,7 @@ class Oracle:
     def __post_init__(self) -> None:
         self.received = np.zeros(self.size, dtype=bool)
 
-    def take(self, start: int, stop: int) -> None:
+    def count_packet(self, start: int, stop: int) -> None:
         """Count a packet with these bytes of the record."""
         if self.received[start:stop].all():
             self.duplicates += 1
@@ -138,7 +153,7 @@ def test_unmasked_bytes_are_right_with_every_disorder_together(
         for copy in range(copies):
             is_cut = rng.random() < cut and len(packet) > 20
             delay = rng.uniform(0, lateness) if rng.random() < shuffle else 0
-            sent_packet = packet[: rng.randint(11, len(packet))] if is_cut else packet
+            sent_packet = packet[: rng.randint(HEADER_BYTES + 1, len(packet))] if is_cut else packet
             sent.append((k + delay + copy / 2, k, sent_packet))
     sent.sort(key=lambda s: s[0])
     arriving = [(k, packet) for _, k, packet in sent]
@@ -154,12 +169,15 @@ def test_unmasked_bytes_are_right_with_every_disorder_together(
             )
             leftovers += 1
         if rng.random() < strange:
-            arriving.insert(position, (-2, rng.choice([b"", b"0123456789", bytes(1467), bytes(1536)])))
+            # No byte at all, a header without payload, and more than a full packet: by one byte, and by many.
+            malformed_packets = [b"", b"0123456789", bytes(HEADER_BYTES + FULL + 1), bytes(1536)]
+            arriving.insert(position, (-2, rng.choice(malformed_packets)))
             malformed += 1
+
     oracle = Oracle(size)
     for k, packet in arriving:
         if k >= 0:
-            oracle.take(k * FULL, k * FULL + len(packet) - 10)
+            oracle.count_packet(k * FULL, k * FULL + len(packet) - HEADER_BYTES)
     placed, out = place(size, [p for _, p in arriving], Counters(count, sequence), frame, batch)
     counts = placed.counts
     assert is_original_or_masked(record, placed, out)
@@ -176,10 +194,14 @@ def test_unmasked_bytes_are_right_with_every_disorder_together(
     assert counts.malformed == malformed
     # The expectation holds if the first packet is the record's first or a full one: a shorter one may be the last of
     # the record before.
-    first_is_of_the_record = bool(arriving) and (arriving[0][0] == 0 or len(arriving[0][1]) == 10 + FULL)
+    first_is_of_the_record = False
+    if arriving:
+        first_number, first_packet = arriving[0]
+        first_is_of_the_record = first_number == 0 or len(first_packet) == HEADER_BYTES + FULL
     if first_is_of_the_record and not counts.disagreeing:
         assert (counts.placed, counts.duplicates, counts.late) == (oracle.placed, oracle.duplicates, oracle.late)
-        assert (counts.leftover, counts.outside) == (leftovers, 0)
+        assert counts.leftover == leftovers
+        assert counts.outside == 0
         assert placed.received == oracle.received.sum()
         losses = placed.losses
         assert losses.head_bytes + losses.gap_bytes + losses.tail_bytes == size - placed.received
@@ -202,48 +224,70 @@ def test_unmasked_bytes_are_right_with_every_disorder_together(
 def test_records_are_found_although_sequence_and_byte_count_drift_apart(
     frames, frame, records, count, sequence, skip, rng: random.Random
 ):
-    """Each record ends with a short packet, so that the byte count is not a multiple of the sequence number."""
+    """Each record ends with a short packet, so that the byte count is not a multiple of the sequence number.
+
+    Up to `skip` packets at the beginning of a record are lost, but less than half of it.
+    """
     start = EarlierRecords(Counters(count, sequence))
     for n in range(records):
         record = Record.make(frames * frame, count, sequence, seed=n)
-        head = rng.randint(0, skip) if len(record.packets) > 2 * skip + 2 else 0
-        placed, out = place(len(record.data), record.packets[head:], start, frame)
+        lost_packets = 0
+        if len(record.packets) > 2 * skip + 2:
+            lost_packets = rng.randint(0, skip)
+        placed, out = place(len(record.data), record.packets[lost_packets:], start, frame)
         assert placed.located
-        assert placed.missing == ([(0, head * FULL)] if head else [])
-        assert placed.losses.head_bytes == head * FULL
+        assert placed.missing == list_head_gap(lost_packets * FULL)
+        assert placed.losses.head_bytes == lost_packets * FULL
         assert is_original_or_masked(record, placed, out)
         count = count + len(record.data)
         sequence = sequence + len(record.packets)
         start = placed.past
 
 
+def list_head_gap(gap_bytes: int) -> list[tuple[int, int]]:
+    """Return the gaps of a row that lacks only its first `gap_bytes`; none if that is 0."""
+    if gap_bytes == 0:
+        return []
+    return [(0, gap_bytes)]
+
+
 def test_losses_are_counted_by_their_place_at_the_head_between_and_at_the_tail():
-    record = Record.make(30 * FULL, 0, 1)
-    received = [p for k, p in enumerate(record.packets) if k not in (0, 1, 7, 12, 13, 29)]
-    placed, _ = place(30 * FULL, [received[1], received[0], *received[2:]], Counters(0, 1), 65536)
+    record = Record.make(30 * FULL, count=0, sequence=1)
+    lost_at_head = (0, 1)
+    lost_between = (7, 12, 13)
+    lost_at_tail = (29,)
+    lost = (*lost_at_head, *lost_between, *lost_at_tail)
+    received = [packet for k, packet in enumerate(record.packets) if k not in lost]
+    # Packet 2 comes after packet 3, whose end is two packets after the beginning of packet 2.
+    exchanged = [received[1], received[0], *received[2:]]
+    placed, _ = place(len(record.data), exchanged, Counters(0, 1), frame=65536)
     assert placed.losses == Losses(head_bytes=2 * FULL, gaps=2, gap_bytes=3 * FULL, tail_bytes=FULL)
-    assert (placed.counts.late, placed.counts.late_by_bytes) == (1, 2 * FULL)
+    assert placed.counts.late == 1
+    assert placed.counts.late_by_bytes == 2 * FULL
 
 
 def test_logging_allocates_nothing_that_stays():
     """Packets create no Python objects: a thousand batches use as many blocks of memory as ten."""
-    size = 256 * FULL
     batch = 256
-    record = Record.make(size, 0, 1)
-    block = np.frombuffer(b"".join(record.packets), dtype=np.uint8).reshape(batch, 10 + FULL).copy()
-    lengths = np.full(batch, 10 + FULL, dtype=np.uint32)
-    log = PacketLog(size * 1000)
-    blocks_of_memory = []
-    for n in range(1000):
-        k = np.arange(n * batch, (n + 1) * batch)
-        block[:, 0:4] = (k + 1).astype("<u4")[:, None].view(np.uint8)
-        block[:, 4:10] = (k * FULL).astype("<u8")[:, None].view(np.uint8)[:, :6]
+    batches = 1000
+    size = batch * FULL
+    record = Record.make(size, count=0, sequence=1)
+    block = np.frombuffer(b"".join(record.packets), dtype=np.uint8).reshape(batch, HEADER_BYTES + FULL).copy()
+    lengths = np.full(batch, HEADER_BYTES + FULL, dtype=np.uint32)
+    log = PacketLog(size * batches)
+    blocks_after_10_batches = 0
+    for n in range(batches):
+        numbers = np.arange(n * batch, (n + 1) * batch)
+        # Four bytes of sequence number and six of byte count.
+        block[:, 0:4] = (numbers + 1).astype("<u4")[:, None].view(np.uint8)
+        block[:, 4:10] = (numbers * FULL).astype("<u8")[:, None].view(np.uint8)[:, :6]
         log.add(block, lengths, n)
-        if n in (9, 999):
-            blocks_of_memory.append(sys.getallocatedblocks())
-    assert log.count == 256_000
+        if n == 9:
+            blocks_after_10_batches = sys.getallocatedblocks()
+    new_blocks = sys.getallocatedblocks() - blocks_after_10_batches
+    assert log.count == batches * batch
     # One object for each of the 990 batches would be more; 3 are measured.
-    assert blocks_of_memory[1] - blocks_of_memory[0] < 200
+    assert new_blocks < 200
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=SLOW)
@@ -255,9 +299,9 @@ def test_logging_allocates_nothing_that_stays():
 )
 def test_a_lost_beginning_is_masked_if_the_start_of_the_record_is_known(head, tail, count, sequence):
     record = Record.make(20 * FULL + tail, count, sequence)
-    placed, out = place(len(record.data), record.packets[head:], Counters(count, sequence), 4096)
+    placed, out = place(len(record.data), record.packets[head:], Counters(count, sequence), FRAME)
     assert placed.located
-    assert placed.missing == ([(0, head * FULL)] if head else [])
+    assert placed.missing == list_head_gap(head * FULL)
     assert is_original_or_masked(record, placed, out)
 
 
@@ -272,19 +316,25 @@ def test_the_lost_bytes_of_a_truncated_packet_are_masked(cut, which, count):
     record = Record.make(20 * FULL + 700, count, 77)
     packets = list(record.packets)
     packets[which] = packets[which][: max(0, len(packets[which]) - cut)]
-    placed, out = place(len(record.data), packets, Counters(count, 77), 4096)
+    placed, out = place(len(record.data), packets, Counters(count, 77), FRAME)
     assert is_original_or_masked(record, placed, out)
-    if which < 20 and placed.located:
-        _, b = record.byte_range(which)
-        assert placed.missing == ([(b - min(cut, FULL), b)] if cut else [])
+    is_last_packet = which == 20
+    if placed.located and not is_last_packet:
+        _, end_of_packet = record.byte_range(which)
+        if cut:
+            assert placed.missing == [(end_of_packet - cut, end_of_packet)]
+        else:
+            assert placed.missing == []
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
 @given(missed=st.integers(1, 5), count=near_wrap, at=st.integers(0, 14))
 def test_missed_frames_are_never_placed_as_if_nothing_was_missing(missed, count, at):
-    whole_record = Record.make(20 * 4096, count, 9)
-    data = whole_record.data[: at * 4096] + whole_record.data[(at + missed) * 4096 :]
-    placed, _ = place(len(whole_record.data), encode_packets(data, 9, count), Counters(count, 9), 4096)
+    """The radar misses `missed` frames from frame `at` on."""
+    whole_record = Record.make(20 * FRAME, count, sequence=9)
+    data = whole_record.data[: at * FRAME] + whole_record.data[(at + missed) * FRAME :]
+    packets = encode_packets(data, sequence=9, byte_count=count)
+    placed, _ = place(len(whole_record.data), packets, Counters(count, 9), FRAME)
     assert not placed.located
     assert placed.missing == [(0, len(whole_record.data))]
 
@@ -300,27 +350,28 @@ def test_a_packet_with_a_wrong_header_is_masked_and_damages_no_other_byte(flip, 
     bad = bytearray(packets[which])
     bad[flip // 8] ^= 1 << flip % 8
     packets[which] = bytes(bad)
-    placed, out = place(len(record.data), packets, Counters(count, 500), 4096)
+    placed, out = place(len(record.data), packets, Counters(count, 500), FRAME)
     assert placed.counts.disagreeing + placed.counts.outside == 1
     assert placed.missing == [record.byte_range(which)]
     assert is_original_or_masked(record, placed, out)
 
 
-@pytest.mark.parametrize(("rows_ahead", "is_later"), [(84, True), (85, False)])
+@pytest.mark.parametrize(("packets_ahead", "is_later"), [(84, True), (85, False)])
 @pytest.mark.parametrize("sequence", [1, SEQUENCE - 30])
-def test_a_packet_far_ahead_is_damaged_and_a_near_one_may_be_of_a_later_record(sequence, rows_ahead, is_later):
-    """Four rows of 20 packets and a bit, and four packets more, are 84 packets and a bit."""
+def test_a_packet_far_ahead_is_damaged_and_a_near_one_may_be_of_a_later_record(sequence, packets_ahead, is_later):
+    """The limit is four rows and four packets. A row has 20.07 packets here, so that the limit is 84.3 packets."""
     record = Record.make(20 * FULL + 100, 0, sequence)
-    other = encode_packet(sequence + rows_ahead, len(record.data), b"x" * FULL)
-    placed, out = place(len(record.data), [*record.packets, other], Counters(0, sequence), 4096)
+    other_packet = encode_packet(sequence + packets_ahead, len(record.data), b"x" * FULL)
+    placed, out = place(len(record.data), [*record.packets, other_packet], Counters(0, sequence), FRAME)
     assert placed.located
     assert out.tobytes() == record.data
+    # After a later record the start of the next one is unknown.
     assert (find_next_start(placed) is None) == is_later
 
 
 def test_a_record_longer_than_a_row_is_not_placed():
-    record = Record.make(6 * 4096, 0, 1)
-    placed, _ = place(5 * 4096, record.packets, Counters(0, 1), 4096)
+    record = Record.make(6 * FRAME, count=0, sequence=1)
+    placed, _ = place(5 * FRAME, record.packets, Counters(0, 1), FRAME)
     assert not placed.located
     assert "more" in placed.reason
     assert placed.counts.outside > 0
@@ -330,7 +381,8 @@ def test_without_a_valid_packet_the_whole_row_is_missing():
     placed, out = place(5000, [], Counters(0, 1))
     assert placed.missing == [(0, 5000)]
     assert find_next_start(placed) is None
-    placed, out = place(5000, [b"", b"short", b"0123456789"], Counters(0, 1))
+    header_alone = b"0123456789"
+    placed, out = place(5000, [b"", b"short", header_alone], Counters(0, 1))
     assert placed.counts.malformed == 3
     assert not out.any()
 
@@ -347,23 +399,28 @@ def test_last_packet_of_the_previous_record_is_not_the_first_of_this_one(rest, c
     late = Record.make(rest, count, sequence, seed=1)
     start = Counters((count + rest) % COUNT, (sequence + 1) % SEQUENCE)
     record = Record.make(20 * FULL + 100, start.byte_count, start.sequence)
-    placed, out = place(len(record.data), late.packets + record.packets, start, frame=4096, batch=batch)
-    assert (placed.located, placed.missing) == (True, [])
+    placed, out = place(len(record.data), late.packets + record.packets, start, frame=FRAME, batch=batch)
+    assert placed.located
+    assert placed.missing == []
     assert out.tobytes() == record.data
-    assert (placed.counts.leftover, placed.counts.placed) == (1, len(record.packets))
-    assert find_next_start(placed) == Counters((count + rest + out.size) % COUNT, (sequence + 1 + 21) % SEQUENCE)
+    assert placed.counts.leftover == 1
+    assert placed.counts.placed == len(record.packets)
+    next_start = find_next_start(placed)
+    assert next_start is not None
+    assert next_start.byte_count == (start.byte_count + out.size) % COUNT
+    assert next_start.sequence == (start.sequence + len(record.packets)) % SEQUENCE
 
 
 def test_truncated_first_packet_is_not_the_last_of_the_record_before():
     record = Record.make(20 * FULL, 5000, 7)
     packets = [record.packets[0][:-400], *record.packets[1:]]
-    placed, out = place(out_size := len(record.data), packets, Counters(5000, 7))
-    assert (placed.located, placed.missing) == (True, [(FULL - 400, FULL)])
+    placed, out = place(len(record.data), packets, Counters(5000, 7))
+    assert placed.located
+    assert placed.missing == [(FULL - 400, FULL)]
     assert is_original_or_masked(record, placed, out)
-    assert out.size == out_size
+    assert out.size == len(record.data)
 
 
-FRAME = 4096
 # Bytes of rows whose last packet is full, and shorter: 91 x 4096 = 256 x 1456, and 62 x 4096 = 174 x 1456 + 608.
 FULL_ENDS = 91 * FRAME
 SHORT_END = 62 * FRAME
@@ -372,22 +429,28 @@ SHORT_END = 62 * FRAME
 @pytest.mark.parametrize("lost", [1, 3])
 @pytest.mark.parametrize("dropped", [0, 16, 1440])
 def test_a_record_without_its_end_is_not_placed(lost, dropped):
-    """Bytes that the card drops internally show only in the record's length."""
+    """The card drops `dropped` bytes before it numbers them, which shows only in the record's length.
+
+    Without the last `lost` packets the length is unknown.
+    """
     row = Record.make(SHORT_END, 70_000, 9)
-    sent = encode_packets(row.data[:5000] + row.data[5000 + dropped :], 9, 70_000)
-    for packets in (sent[:-lost], sent):
-        placed, out = place(SHORT_END, packets, Counters(70_000, 9), FRAME)
-        assert is_original_or_masked(row, placed, out)
-        assert not placed.slipped
-    assert placed.located == (dropped == 0)
+    sent = encode_packets(row.data[:5000] + row.data[5000 + dropped :], sequence=9, byte_count=70_000)
+    without_end, out = place(SHORT_END, sent[:-lost], Counters(70_000, 9), FRAME)
+    assert is_original_or_masked(row, without_end, out)
+    assert not without_end.slipped
+    with_end, out = place(SHORT_END, sent, Counters(70_000, 9), FRAME)
+    assert is_original_or_masked(row, with_end, out)
+    assert not with_end.slipped
+    assert with_end.located == (dropped == 0)
 
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_a_lost_start_is_known_again_after_a_reset(size):
     card = Card(size, 70_000, 9)
-    past = place(size, card.record().packets[:-3], EarlierRecords(Counters(70_000, 9)), FRAME)[0].past
-    assert past.lost
-    assert not place(size, card.record().packets, past, FRAME)[0].located
+    without_end, _ = place(size, card.record().packets[:-3], EarlierRecords(Counters(70_000, 9)), FRAME)
+    assert without_end.past.lost
+    after_lost_start, _ = place(size, card.record().packets, without_end.past, FRAME)
+    assert not after_lost_start.located
     card.reset()
     record_after_reset = card.record()
     placed, out = place(size, record_after_reset.packets, EarlierRecords.after_reset(), FRAME)
@@ -397,9 +460,9 @@ def test_a_lost_start_is_known_again_after_a_reset(size):
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_every_second_take_of_a_card_that_restarts_its_counters_in_each_record_is_kept(size):
+    """After a record with unexpected counters the start of the next one is not known, and the host resets the card."""
     card = Card(size)
     past = EarlierRecords.after_reset()
-    """After such a record the start of the next one is not known, and the host resets the card."""
     accepted = []
     for _ in range(6):
         card.reset()
@@ -415,8 +478,9 @@ def test_every_second_take_of_a_card_that_restarts_its_counters_in_each_record_i
 @pytest.mark.parametrize("before", [1, 2, 5])
 @pytest.mark.parametrize("start", [Counters(0, 1), Counters(70_000, 9)])
 def test_a_restart_within_a_row_gives_no_wrong_byte(size, before, start):
+    """The card restarts before packet `before`, and the last packets may be lost."""
     card = Card(size, start.byte_count, start.sequence)
-    row = card.record((before,))
+    row = card.record(resets=(before,))
     for lost_packets in (0, 1, 4):
         placed, out = place(size, row.packets[: len(row.packets) - lost_packets], start, FRAME)
         assert is_original_or_masked(row, placed, out)
@@ -425,16 +489,22 @@ def test_a_restart_within_a_row_gives_no_wrong_byte(size, before, start):
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_a_late_packet_of_the_first_record_is_not_a_restart(size):
-    """A card that restarts within a row does not reach its end: these counters are of an earlier record."""
-    record = Record.make(size, 5 * size, 5 * -(-size // FULL) + 1)
-    late = Record.make(size, 0, 1, seed=1).packets[7]
-    start = Counters(5 * size, 5 * -(-size // FULL) + 1)
-    placed, out = place(size, [*record.packets[:9], late, *record.packets[9:]], start, FRAME)
+    """A card that restarts within a row does not reach the row's end. This row does, after five earlier ones.
+
+    Without the last packet the row may also be one in which the card has restarted.
+    """
+    packets_of_row = math.ceil(size / FULL)
+    start = Counters(5 * size, 5 * packets_of_row + 1)
+    record = Record.make(size, start.byte_count, start.sequence)
+    late_packet = Record.make(size, 0, 1, seed=1).packets[7]
+    packets = [*record.packets[:9], late_packet, *record.packets[9:]]
+    placed, out = place(size, packets, start, FRAME)
     assert placed.complete
     assert placed.counts.restarted == 1
     assert not placed.past.lost
     assert out.tobytes() == record.data
-    assert not place(size, [*record.packets[:9], late, *record.packets[9:-1]], start, FRAME)[0].located
+    without_end, _ = place(size, packets[:-1], start, FRAME)
+    assert not without_end.located
 
 
 def test_a_packet_that_comes_twice_with_different_bytes_is_masked():
@@ -444,8 +514,9 @@ def test_a_packet_that_comes_twice_with_different_bytes_is_masked():
     conflicting_packet[500] ^= 1
     packets = [*record.packets, bytes(conflicting_packet), record.packets[9]]
     placed, out = place(len(record.data), packets, Counters(5000, 7), FRAME)
-    assert placed.missing == [(7 * FULL, 8 * FULL)]
-    assert (placed.counts.conflicting, placed.counts.duplicates) == (1, 1)
+    assert placed.missing == [record.byte_range(7)]
+    assert placed.counts.conflicting == 1
+    assert placed.counts.duplicates == 1
     assert is_original_or_masked(record, placed, out)
 
 
@@ -474,36 +545,49 @@ def test_placing_does_not_change_the_logged_payload(trouble, tmp_path):
     packets = list(record.packets)
     if "conflict" in trouble:
         # Packet 7 once more, with other bytes.
-        packets.append(encode_packet(8, 7 * FULL, bytes(255 - b for b in record.packets[7][10:])))
+        inverted_payload = bytes(255 - byte for byte in record.packets[7][HEADER_BYTES:])
+        packets.append(encode_packet(sequence=8, byte_count=7 * FULL, payload=inverted_payload))
     # The record may be a packet shorter than the row.
     size = len(record.data)
     if "short" in trouble:
         size += FULL
     # A packet far outside of the row.
-    packets.append(encode_packet(99, 5 * size, bytes([9] * 99)))
+    packets.append(encode_packet(sequence=99, byte_count=5 * size, payload=bytes([9] * 99)))
     log = make_log(size, packets)
     past = EarlierRecords.after_reset()
     payload_before = log.payload[: log.payload_bytes].copy()
     placed, out = place_record(log, FRAME, past)
     assert (log.payload[: payload_before.size] == payload_before).all()
     write_packets(tmp_path / "0000.pkt", log, Evidence(size, FRAME, past=past), placed)
-    second_placement, second_out = place_record(read_packets(tmp_path / "0000.pkt", out)[1], FRAME, past)
-    assert (second_placement.counts, second_placement.missing) == (placed.counts, placed.missing)
+    _, log_from_file = read_packets(tmp_path / "0000.pkt", out)
+    second_placement, second_out = place_record(log_from_file, FRAME, past)
+    assert second_placement.counts == placed.counts
+    assert second_placement.missing == placed.missing
     assert (second_out == out).all()
 
 
-def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
-    """Such packets are left over from an earlier record; with counters of this row they are frames without a pulse."""
-    # Two packets come at time 1, before the first pulse at 50; the others after it.
+def place_around_first_pulse(early: list[bytes], later: list[bytes]) -> tuple[PlacedRecord, np.ndarray]:
+    """Place a row whose first pulse is at 50 ns: the early packets come at 1 ns, the later ones from 100 ns on."""
+    log = make_log(SHORT_END, early, t_ns=1)
+    for k, packet in enumerate(later):
+        log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 100 + k)
+    return place_record(log, FRAME, EarlierRecords(Counters(70_000, 9)), not_before_ns=50)
+
+
+def test_packets_of_an_earlier_record_before_the_first_pulse_are_left_over():
+    earlier_record = Record.make(2 * FULL, 70_000 - 2 * FULL, 7)
     record = Record.make(SHORT_END, 70_000, 9)
-    for early, located in ((Record.make(2 * FULL, 70_000 - 2 * FULL, 7), True), (record, False)):
-        log = make_log(SHORT_END, early.packets[:2], t_ns=1)
-        block = [np.frombuffer(p, dtype=np.uint8) for p in record.packets[0 if located else 2 :]]
-        for k, packet in enumerate(block):
-            log.add(packet[None, :], np.array([len(packet)]), 100 + k)
-        placed, out = place_record(log, FRAME, EarlierRecords(Counters(70_000, 9)), not_before_ns=50)
-        assert placed.located == located
-        assert is_original_or_masked(record, placed, out)
+    placed, out = place_around_first_pulse(earlier_record.packets, record.packets)
+    assert placed.located
+    assert is_original_or_masked(record, placed, out)
+
+
+def test_a_row_with_packets_of_its_own_before_the_first_pulse_is_not_located():
+    """Frames came without a pulse."""
+    record = Record.make(SHORT_END, 70_000, 9)
+    placed, out = place_around_first_pulse(record.packets[:2], record.packets[2:])
+    assert not placed.located
+    assert is_original_or_masked(record, placed, out)
 
 
 def test_a_complete_record_with_the_counters_of_another_card_is_not_the_row():
@@ -512,6 +596,8 @@ def test_a_complete_record_with_the_counters_of_another_card_is_not_the_row():
     placed, _ = place(SHORT_END, twin.record().packets, EarlierRecords(Counters(70_000, 9)), FRAME)
     assert not placed.located
     earlier_record = Record.make(SHORT_END, 0, 1)
-    mixed = [p for pair in zip(earlier_record.packets, twin.record().packets, strict=True) for p in pair]
+    mixed = []
+    for packet, twin_packet in zip(earlier_record.packets, twin.record().packets, strict=True):
+        mixed += [packet, twin_packet]
     placed, out = place(SHORT_END, mixed, EarlierRecords.after_reset(), FRAME)
     assert is_original_or_masked(earlier_record, placed, out)

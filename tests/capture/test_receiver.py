@@ -1,5 +1,6 @@
 """The receiver process over real sockets: bit-exact rows, masked losses, clear errors, a clean end."""
 
+import math
 import os
 import signal
 import socket
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.capture.records import FULL, encode_packets
+from tests.support.capture.records import FULL, HEADER_BYTES, encode_packets
 from tests.support.processes import wait_for
 from tests.support.refusals import expect_refusal
 
@@ -27,12 +28,16 @@ from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
 from polysight_shared.errors import DeviceError, ErrorCode
 
+# Bytes of a frame
+FRAME = 4096
+
 
 @pytest.fixture
 def card(board):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind((board.card_address, 1024))
-        yield s
+    """A socket that sends from the address and port of the board's card."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind((board.card_address, 1024))
+        yield sender
 
 
 def draw_noise(size: int, seed: int) -> bytes:
@@ -46,23 +51,55 @@ def send(card: socket.socket, board: Board, packets: list[bytes]) -> None:
         card.sendto(packet, (board.host_address, board.data_port))
 
 
+def begin_row(
+    receiver: ReceiverProcess,
+    path: Path,
+    expected_bytes: int,
+    frame_bytes: int = FRAME,
+    row: int = 0,
+    take: int = 1,
+    after_reset: bool = True,
+) -> int:
+    """Begin a row of this size; return the number of packets from before it that the receiver has dropped.
+
+    `after_reset`: the card's counters begin at zero again.
+    """
+    return receiver.begin_row(row, take, expected_bytes, frame_bytes, path, after_reset=after_reset)
+
+
+def make_open(board: Board) -> Open:
+    """Return the request to open the data socket of a board, with a receive buffer that a kernel grants to anyone."""
+    return Open(
+        board=board.name,
+        host_address=board.host_address,
+        data_port=board.data_port,
+        card_address=board.card_address,
+        buffer_bytes=212_992,
+    )
+
+
+def make_begin_row(path: Path, expected_bytes: int) -> BeginRow:
+    """Return the request to receive row 0 with frames as long as a packet."""
+    return BeginRow(row=0, take=1, expected_bytes=expected_bytes, frame_bytes=FULL, path=str(path), after_reset=True)
+
+
 def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
-    size = 300 * 4096
-    first = draw_noise(size, 1)
-    second = draw_noise(size, 2)
-    third = draw_noise(size, 3)
-    count = 0
-    sequence = 1
-    # Packets of a row.
-    n = -(-size // FULL)
+    size = 300 * FRAME
+    first = draw_noise(size, seed=1)
+    second = draw_noise(size, seed=2)
+    third = draw_noise(size, seed=3)
+    packets_of_row = math.ceil(size / FULL)
+    disturbed_row = 1
     with ReceiverProcess(board, 4 << 20) as receiver:
         assert receiver.granted_bytes >= 1 << 20
         for k, data in enumerate((first, second, third)):
             path = tmp_path / f"{k}.part"
-            assert receiver.begin_row(k, 1, size, 4096, path, after_reset=k == 0) == 0
-            packets = encode_packets(data, sequence + k * n, count + k * size)
-            if k == 1:
-                # The first two packets are lost, two are exchanged, and one of them comes twice.
+            stale_packets = begin_row(receiver, path, size, row=k, after_reset=k == 0)
+            assert stale_packets == 0
+            # The card's counters continue from row to row.
+            packets = encode_packets(data, sequence=1 + k * packets_of_row, byte_count=k * size)
+            if k == disturbed_row:
+                # The first two packets are lost, two are exchanged, one of them comes twice, and one is too short.
                 packets = [*packets[2:50], packets[51], packets[50], packets[51], *packets[52:]]
                 send(card, board, [*packets, b"tiny"])
                 wait_for(lambda: receiver.report().received == size - 2 * FULL, "packets")
@@ -70,52 +107,67 @@ def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
                 send(card, board, packets)
                 wait_for(lambda: receiver.poll().complete, "packets")
             row = receiver.end_row()
-            assert (row.row, row.take, row.expected, row.located) == (k, 1, size, True)
+            assert (row.row, row.take, row.expected) == (k, 1, size)
+            assert row.located
             assert row.crc32 == zlib.crc32(path.read_bytes())
             assert row.kernel_drops == 0
             facts, arrivals = read_index(path.with_suffix(".idx"))
+            times_ns = arrivals[:, 0].tolist()
             assert row.index_crc32 == zlib.crc32(path.with_suffix(".idx").read_bytes())
             assert (np.diff(arrivals, axis=0) >= 0).all()
-            assert (int(arrivals[0, 0]), int(arrivals[-1, 0])) == (row.first_arrival_ns, row.last_arrival_ns)
-            if k == 1:
+            assert times_ns[0] == row.first_arrival_ns
+            assert times_ns[-1] == row.last_arrival_ns
+            counts = row.counts
+            if k == disturbed_row:
                 assert row.missing == [(0, 2 * FULL)]
                 assert facts["missing"] == [[0, 2 * FULL]]
-                assert (row.counts.late, row.counts.duplicates, row.counts.malformed) == (1, 1, 1)
+                assert (counts.late, counts.duplicates, counts.malformed) == (1, 1, 1)
                 assert path.read_bytes() == bytes(2 * FULL) + data[2 * FULL :]
             else:
                 assert row.complete
-                assert (row.counts.late, row.counts.duplicates, row.counts.placed, row.counts.short) == (0, 0, n, 1)
+                assert (counts.late, counts.duplicates) == (0, 0)
+                assert counts.placed == packets_of_row
+                # Only the last packet is not full.
+                assert counts.short == 1
                 assert path.read_bytes() == data
 
 
 @pytest.mark.parametrize("source_port", [1024, 4098, 0])
 def test_packets_of_the_card_are_data_from_any_source_port(board, tmp_path, source_port):
-    data = draw_noise(20_000, 4)
+    data = draw_noise(20_000, seed=4)
     with (
         ReceiverProcess(board, 1 << 20) as receiver,
         closing(bind_udp(board.card_address, source_port, "card")) as card,
     ):
-        receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part", after_reset=True)
-        send(card, board, encode_packets(data, 1, 0))
+        begin_row(receiver, tmp_path / "a.part", len(data), frame_bytes=1)
+        send(card, board, encode_packets(data, sequence=1, byte_count=0))
         wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row()
-    assert (row.complete, row.strangers) == (True, 0)
+    assert row.complete
+    assert row.strangers == 0
     assert (tmp_path / "a.part").read_bytes() == data
 
 
 def test_packets_of_other_machines_and_from_before_the_row_are_not_data(board, card, tmp_path):
-    data = draw_noise(20_000, 4)
-    stranger_address = (board.host_address, 0)
-    with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*stranger_address, "stranger")) as stranger:
-        send(card, board, encode_packets(draw_noise(5000, 5), 1, 0))
+    data = draw_noise(20_000, seed=4)
+    packets_from_before = encode_packets(draw_noise(5000, seed=5), sequence=1, byte_count=0)
+    assert len(packets_from_before) == 4
+    packet_of_stranger = encode_packets(draw_noise(5000, seed=6), sequence=1, byte_count=0)[0]
+    any_port = 0
+    with (
+        ReceiverProcess(board, 1 << 20) as receiver,
+        closing(bind_udp(board.host_address, any_port, "stranger")) as stranger,
+    ):
+        send(card, board, packets_from_before)
         wait_for(lambda: _count_waiting_bytes(board) > 0, "packets")
-        assert receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part", after_reset=True) == 4
-        stranger.sendto(encode_packets(draw_noise(5000, 6), 1, 0)[0], (board.host_address, board.data_port))
-        send(card, board, encode_packets(data, 1, 0))
+        assert begin_row(receiver, tmp_path / "a.part", len(data), frame_bytes=1) == 4
+        stranger.sendto(packet_of_stranger, (board.host_address, board.data_port))
+        send(card, board, encode_packets(data, sequence=1, byte_count=0))
         wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row()
     assert row.complete
-    assert (row.strangers, row.stale) == (1, 4)
+    assert row.strangers == 1
+    assert row.stale == 4
     assert (tmp_path / "a.part").read_bytes() == data
 
 
@@ -131,18 +183,18 @@ def test_a_row_is_reported_as_complete_without_a_request(board, card, tmp_path, 
     """This also holds if the last packet is full, so that its size does not show that it is the last one."""
     for name in ("take_core", "take_priority"):
         monkeypatch.setattr(receiver_process, name, lambda *_, **__: (None, ""))
-    data = draw_noise(3 * FULL + last_bytes, 8)
+    data = draw_noise(3 * FULL + last_bytes, seed=8)
     host, process = Pipe()
     receiver = receiver_process.Receiver(process)
-    receiver._answer(Open(board.name, board.host_address, board.data_port, board.card_address, 212_992))
-    receiver._answer(BeginRow(0, 1, len(data), FULL, str(tmp_path / "a.part"), after_reset=True))
-    packets = encode_packets(data, 1, 0)
-    reports = []
-    for sent in (packets[:-1], packets[-1:]):
-        send(card, board, sent)
-        receiver._receive()
-        reports.append(host.poll())
-    assert reports == [False, True]
+    receiver._answer(make_open(board))
+    receiver._answer(make_begin_row(tmp_path / "a.part", len(data)))
+    *first_packets, last_packet = encode_packets(data, sequence=1, byte_count=0)
+    send(card, board, first_packets)
+    receiver._receive()
+    assert not host.poll()
+    send(card, board, [last_packet])
+    receiver._receive()
+    assert host.poll()
     receiver._discard()
     assert receiver._socket is not None
     receiver._socket.close()
@@ -152,51 +204,62 @@ def test_a_row_is_reported_as_complete_without_a_request(board, card, tmp_path, 
 
 @pytest.mark.parametrize("clock_set_s", [0, 3600])
 def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch, clock_set_s):
-    """The first 270 packets are of another machine; the receiver reads one batch at a time; the clock may be set.
+    """The first packets are of another machine, the receiver reads one batch at a time, and the clock may be set.
 
-    The packets fit into the buffer that a kernel grants without rights (208 KiB requested, twice that granted).
+    The packets fit into the buffer that a kernel grants to anyone (208 KiB requested, twice that granted).
     """
+    packets_of_stranger = 270
     for name in ("take_core", "take_priority"):
         monkeypatch.setattr(receiver_process, name, lambda *_, **__: (None, ""))
     monkeypatch.setattr(receiver_process, "_MAX_BATCHES", 1)
-    data = draw_noise(40 * FULL, 7)
+    data = draw_noise(40 * FULL, seed=7)
     receiver = receiver_process.Receiver(Connection(os.open(os.devnull, os.O_RDWR)))
-    answer = receiver._answer
-    answer(Open(board.name, board.host_address, board.data_port, board.card_address, 212_992))
-    answer(BeginRow(0, 1, len(data), FULL, str(tmp_path / "a.part"), after_reset=True))
-    with closing(bind_udp(board.host_address, 0, "stranger")) as stranger:
-        for _ in range(270):
+    receiver._answer(make_open(board))
+    receiver._answer(make_begin_row(tmp_path / "a.part", len(data)))
+    any_port = 0
+    with closing(bind_udp(board.host_address, any_port, "stranger")) as stranger:
+        for _ in range(packets_of_stranger):
             stranger.sendto(b"x" * 100, (board.host_address, board.data_port))
-    send(card, board, encode_packets(data, 1, 0))
+    send(card, board, encode_packets(data, sequence=1, byte_count=0))
     assert receiver._batches is not None
     receiver._batches._clocks_differ_ns -= clock_set_s * 10**9
-    row = answer(EndRow())
+    row = receiver._answer(EndRow())
     assert receiver._socket is not None
     receiver._socket.close()
     assert isinstance(row, RowCapture)
-    assert (row.complete, row.strangers, row.kernel_drops) == (True, 270, 0)
+    assert row.complete
+    assert row.strangers == packets_of_stranger
+    assert row.kernel_drops == 0
 
 
 def _count_waiting_bytes(board: Board) -> int:
-    """Number of bytes that wait in the kernel for the data port."""
-    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
-        words = line.split()
-        if int(words[1].split(":")[1], 16) == board.data_port and words[1].startswith(
-            socket.inet_aton(board.host_address)[::-1].hex().upper()
-        ):
-            return int(words[4].split(":")[1], 16)
+    """Return the number of bytes that wait in the kernel for the data port, from /proc/net/udp.
+
+    After its number a line has the local address, the remote one, the state, and the bytes to send and to receive. All
+    numbers are hexadecimal; an IP address has its last byte first.
+    """
+    address = socket.inet_aton(board.host_address)[::-1].hex().upper()
+    local_address_of_board = f"{address}:{board.data_port:04X}"
+    _, *lines = Path("/proc/net/udp").read_text().splitlines()
+    for line in lines:
+        _, local_address, _, _, queues, *_ = line.split()
+        if local_address == local_address_of_board:
+            _, bytes_to_receive = queues.split(":")
+            return int(bytes_to_receive, 16)
     return 0
 
 
 def test_a_new_row_discards_the_one_before_and_may_be_empty(board, tmp_path):
     with ReceiverProcess(board, 1 << 20) as receiver:
-        receiver.begin_row(0, 1, 4096, 4096, tmp_path / "a.part")
-        # Before the process has said anything of the row
+        begin_row(receiver, tmp_path / "a.part", FRAME, take=1, after_reset=False)
+        # The process has not reported anything of the row yet.
         assert not receiver._progress.complete
-        receiver.begin_row(0, 2, 4096, 4096, tmp_path / "b.part")
+        begin_row(receiver, tmp_path / "b.part", FRAME, take=2, after_reset=False)
         assert not (tmp_path / "a.part").exists()
         row = receiver.end_row()
-    assert (row.counts.placed, row.missing, row.first_arrival_ns) == (0, [(0, 4096)], 0)
+    assert row.counts.placed == 0
+    assert row.missing == [(0, FRAME)]
+    assert row.first_arrival_ns == 0
 
 
 def test_errors_of_the_receiver_process_are_raised_in_the_host(board, tmp_path):
@@ -205,7 +268,7 @@ def test_errors_of_the_receiver_process_are_raised_in_the_host(board, tmp_path):
             ReceiverProcess(board, 1 << 20)
         (tmp_path / "file").write_text("")
         with expect_refusal(ErrorCode.FILE_UNWRITABLE):
-            receiver.begin_row(0, 1, 4096, 4096, tmp_path / "file" / "a.part")
+            begin_row(receiver, tmp_path / "file" / "a.part", FRAME, after_reset=False)
         with pytest.raises(DeviceError):
             receiver.end_row()
         os.kill(receiver._process.pid, signal.SIGKILL)
@@ -255,31 +318,40 @@ def test_packets_dropped_by_the_kernel_count_only_for_their_board(board, card, t
         data_port=4203,
         mount=(),
     )
-    with ReceiverProcess(board, 1 << 16) as stopped_receiver, ReceiverProcess(other_board, 1 << 16) as other_receiver:
+    # The buffer of 64 KiB holds some of the packets, and not all.
+    buffer_bytes = 1 << 16
+    packets_of_row = 2000
+    packets_to_other = 20
+    row_bytes = packets_of_row * FULL
+    with (
+        ReceiverProcess(board, buffer_bytes) as stopped_receiver,
+        ReceiverProcess(other_board, buffer_bytes) as other_receiver,
+    ):
         for receiver in (stopped_receiver, other_receiver):
-            receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part", after_reset=True)
+            begin_row(receiver, tmp_path / f"{receiver.board.name}.part", row_bytes, frame_bytes=FULL)
         os.kill(stopped_receiver.pid, signal.SIGSTOP)
-        packets = encode_packets(draw_noise(2000 * FULL, 3), 1, 0)
+        packets = encode_packets(draw_noise(row_bytes, seed=3), sequence=1, byte_count=0)
         for packet in packets:
             card.sendto(packet, (board.host_address, board.data_port))
-        for packet in packets[:20]:
+        for packet in packets[:packets_to_other]:
             card.sendto(packet, (other_board.host_address, other_board.data_port))
         os.kill(stopped_receiver.pid, signal.SIGCONT)
-        wait_for(lambda: other_receiver.report().received == 20 * FULL, "packets")
+        wait_for(lambda: other_receiver.report().received == packets_to_other * FULL, "packets")
         row_with_drops = stopped_receiver.end_row()
-        assert row_with_drops.kernel_drops == 2000 - row_with_drops.counts.placed > 0
-        assert row_with_drops.losses.tail_bytes == 2000 * FULL - row_with_drops.bytes
+        assert row_with_drops.kernel_drops > 0
+        assert row_with_drops.kernel_drops == packets_of_row - row_with_drops.counts.placed
+        assert row_with_drops.losses.tail_bytes == row_bytes - row_with_drops.bytes
         assert other_receiver.end_row().kernel_drops == 0
         # The next row begins to count at zero.
-        stopped_receiver.begin_row(1, 1, 4096, 4096, tmp_path / "next.part")
+        begin_row(stopped_receiver, tmp_path / "next.part", FRAME, row=1, after_reset=False)
         assert stopped_receiver.end_row().kernel_drops == 0
 
 
 def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
-    data = draw_noise(20_000, 4)
+    data = draw_noise(20_000, seed=4)
     with ReceiverProcess(board, 1 << 20) as receiver:
-        receiver.begin_row(0, 1, len(data), 1000, tmp_path / "a.part", after_reset=True)
-        send(card, board, encode_packets(data, 1, 0))
+        begin_row(receiver, tmp_path / "a.part", len(data), frame_bytes=1000)
+        send(card, board, encode_packets(data, sequence=1, byte_count=0))
         wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row(Status.LVDS_BUFFER_FULL | Status.RECORD_COMPLETED)
     assert row.lost_before_packets == Status.LVDS_BUFFER_FULL
@@ -292,8 +364,8 @@ def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
 def test_the_short_last_packet_is_reported_immediately(board, card, tmp_path):
     """Frames were missed: the byte count is not reached, and the card's short last packet shows the end."""
     with ReceiverProcess(board, 1 << 20) as receiver:
-        receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part", after_reset=True)
-        send(card, board, encode_packets(draw_noise(36_864, 4), 1, 0))
+        begin_row(receiver, tmp_path / "a.part", 10 * FRAME)
+        send(card, board, encode_packets(draw_noise(9 * FRAME, seed=4), sequence=1, byte_count=0))
         wait_for(lambda: receiver.poll().ended, "packets")
         assert not receiver.poll().complete
         row = receiver.end_row()
@@ -301,24 +373,34 @@ def test_the_short_last_packet_is_reported_immediately(board, card, tmp_path):
     assert "1 frames early" in row.reason
 
 
+COMPLETE = Progress(row=0, take=1, received=9, complete=True, last_arrival_ns=1)
+INCOMPLETE = Progress(row=0, take=1, received=9, complete=False, last_arrival_ns=1)
+# A packet came 0.2 s after the end of the row, which is at 1 s.
+LATE_PACKET = Progress(row=0, take=1, received=9, complete=False, last_arrival_ns=1_200_000_000)
+SHORT_LAST_PACKET = Progress(row=0, take=1, received=9, complete=False, last_arrival_ns=1, ended=True)
+NO_PACKET = Progress(row=0, take=1, received=0, complete=False, last_arrival_ns=0)
+NO_STATUS = Status(0)
+
+
 @pytest.mark.parametrize(
     ("progress", "status", "now_s", "ended"),
     [
         # The row ended at 1 s. Its record has ended when it is complete; after a silence of 0.2 s (`GRACE_NS`) if the
         # card has reported the end, by its status or a short last packet; or after 3 s of silence.
-        (Progress(0, 1, 9, True, 1), Status(0), 1.0, True),
-        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.1, False),
-        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.3, True),
-        (Progress(0, 1, 9, False, 1_200_000_000), Status.RECORD_COMPLETED, 1.3, False),
-        (Progress(0, 1, 9, False, 1, True), Status(0), 1.1, False),
-        (Progress(0, 1, 9, False, 1, True), Status(0), 1.3, True),
-        (Progress(0, 1, 9, False, 1), Status.NO_LVDS_DATA, 3.9, False),
-        (Progress(0, 1, 9, False, 1), Status(0), 4.1, True),
-        (Progress(0, 1, 0, False, 0), Status(0), 4.1, True),
+        (COMPLETE, NO_STATUS, 1.0, True),
+        (INCOMPLETE, Status.RECORD_COMPLETED, 1.1, False),
+        (INCOMPLETE, Status.RECORD_COMPLETED, 1.3, True),
+        (LATE_PACKET, Status.RECORD_COMPLETED, 1.3, False),
+        (SHORT_LAST_PACKET, NO_STATUS, 1.1, False),
+        (SHORT_LAST_PACKET, NO_STATUS, 1.3, True),
+        (INCOMPLETE, Status.NO_LVDS_DATA, 3.9, False),
+        (INCOMPLETE, NO_STATUS, 4.1, True),
+        (NO_PACKET, NO_STATUS, 4.1, True),
     ],
 )
 def test_a_record_ends_with_the_first_of_its_signs_or_its_time_limit(progress, status, now_s, ended):
-    assert has_record_ended(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) == ended
+    now_ns = int(now_s * 1e9)
+    assert has_record_ended(progress, status, since_ns=10**9, now_ns=now_ns, silence_ns=3 * 10**9) == ended
 
 
 class SuspendedClocks:
@@ -330,7 +412,10 @@ class SuspendedClocks:
         self._pauses_ns = pauses_ns
 
     def monotonic_ns(self) -> int:
-        self._now_ns += 100 + (self._pauses_ns.pop(0) if self._pauses_ns else 0)
+        # A reading takes 100 ns.
+        self._now_ns += 100
+        if self._pauses_ns:
+            self._now_ns += self._pauses_ns.pop(0)
         return self._now_ns
 
     def time_ns(self) -> int:
@@ -346,11 +431,15 @@ def test_a_pause_between_readings_of_two_clocks_does_not_change_their_difference
 
 
 def test_of_readings_that_were_all_interrupted_the_closest_counts(monkeypatch):
-    # Five attempts of three readings each, with pauses in the middle one: the second attempt has the shortest, 30 us.
-    # The other clock was read somewhere within it, so that half of it is the error.
-    pauses_ns = [0, 800_000, 0, 0, 30_000, 0, 0, 500_000, 0, 0, 600_000, 0, 0, 700_000, 0]
+    # Five attempts of three readings each, with a pause in the middle reading, which is that of the other clock. The
+    # second attempt has the shortest pause. The other clock was read at the end of the pause and counts as read in its
+    # middle, so that half of the pause is the error.
+    pauses_of_attempts_ns = [800_000, 30_000, 500_000, 600_000, 700_000]
+    pauses_ns = []
+    for pause_ns in pauses_of_attempts_ns:
+        pauses_ns += [0, pause_ns, 0]
     monkeypatch.setattr(network, "time", SuspendedClocks(5_000_000_000, pauses_ns))
-    assert network.measure_clock_difference() == 5_000_000_000 + 30_000 // 2
+    assert network.measure_clock_difference() == 5_000_000_000 + min(pauses_of_attempts_ns) // 2
 
 
 def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, card):
@@ -375,13 +464,17 @@ def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, ca
 
 
 def test_a_receiver_is_drained_when_a_batch_is_not_full(board, card):
-    """Packets sent before each read of at most two, packets that it returns, and whether none can wait any more."""
+    """A read returns at most two packets.
+
+    `sent`: packets sent before the read, `received`: packets that it returns, `is_drained`: none can wait any more.
+    """
     with closing(bind_udp(board.host_address, board.data_port, "x")) as sock:
         receiver = BatchReceiver(sock, board.card_address, batch=2)
         for sent, received, is_drained in ((1, 1, True), (2, 2, False), (0, 0, True), (3, 2, False), (0, 1, True)):
             for _ in range(sent):
                 card.sendto(b"0123456789a", (board.host_address, board.data_port))
-            assert (receiver.receive(), receiver.is_drained) == (received, is_drained)
+            assert receiver.receive() == received
+            assert receiver.is_drained == is_drained
 
 
 def test_the_kernel_counts_the_packets_that_a_full_socket_drops(board, card):
@@ -391,7 +484,7 @@ def test_the_kernel_counts_the_packets_that_a_full_socket_drops(board, card):
         assert network.count_kernel_drops(sock) == 0
         sent = 100
         for _ in range(sent):
-            card.sendto(bytes(1466), (board.host_address, board.data_port))
+            card.sendto(bytes(HEADER_BYTES + FULL), (board.host_address, board.data_port))
         received = receiver.receive()
         # The buffer of 16 KiB holds some of the packets, and not all.
         assert 0 < received < sent

@@ -22,10 +22,23 @@ from polysight_simulators.faults import Faults
 
 # No bit of the status is set.
 NO_STATUS = Status(0)
+# Version 2.8 as the card encodes it: the major number in bits 0 to 6, the minor one in bits 7 to 13.
+VERSION_2_8 = 2 | 8 << 7
+
+
+def wait_until_readable(client: CardClient) -> None:
+    """Wait until a datagram waits in the socket of the client."""
+    readable, _, _ = select.select([client], [], [], HANG_S)
+    assert readable
 
 
 def test_a_card_is_configured_with_the_bytes_that_a_real_card_accepted(scripted_card):
-    client, card = scripted_card(lambda code, _: [reply(code, 0x0402 if code == Code.VERSION else 0)])
+    def answer(code, _):
+        if code == Code.VERSION:
+            return [reply(code, VERSION_2_8)]
+        return [reply(code)]
+
+    client, card = scripted_card(answer)
     client.check_alive()
     client.configure(Card())
     assert str(client.read_version()) == "2.8"
@@ -49,7 +62,7 @@ def test_a_card_is_configured_with_the_bytes_that_a_real_card_accepted(scripted_
 def test_replies_and_status_count_from_any_source_port(scripted_card, source_port):
     """Only the address identifies a card, so the socket is not connected to one port."""
     client, _ = scripted_card(
-        lambda code, _: [reply(Code.STATUS, Status.NO_LVDS_DATA), reply(code, 0x0402)], source_port=source_port
+        lambda code, _: [reply(Code.STATUS, Status.NO_LVDS_DATA), reply(code, VERSION_2_8)], source_port=source_port
     )
     assert str(client.read_version()) == "2.8"
     assert client.take_status() == Status.NO_LVDS_DATA
@@ -79,8 +92,9 @@ def test_a_command_whose_reply_was_lost_is_sent_again(scripted_card):
 
 def test_a_reply_that_waits_while_the_program_is_stopped_is_not_lost(scripted_card, monkeypatch):
     """The program is delayed after its request, or the machine sleeps: it reads the reply after the timeout."""
-    client, sent_to = scripted_card(lambda code, _: [reply(code)])
+    client, card_of_board = scripted_card(lambda code, _: [reply(code)])
     requests = []
+    # Each reading of the clock is longer after the one before than any timeout.
     clock_s = itertools.count(0.0, 1e6)
 
     def encode(code, data):
@@ -90,13 +104,13 @@ def test_a_reply_that_waits_while_the_program_is_stopped_is_not_lost(scripted_ca
     def monotonic() -> float:
         # After the request time passes only when the reply waits in the socket; then the timeout is over.
         if requests:
-            assert select.select([client], [], [], HANG_S)[0]
+            wait_until_readable(client)
         return next(clock_s)
 
     monkeypatch.setattr(card, "dca1000", SimpleNamespace(**vars(dca1000) | {"encode_request": encode}))
     monkeypatch.setattr(card, "time", SimpleNamespace(monotonic=monotonic))
     client.check_alive()
-    assert [code for code, _ in sent_to.seen] == [Code.ALIVE]
+    assert [code for code, _ in card_of_board.seen] == [Code.ALIVE]
 
 
 def test_a_flood_of_replies_of_another_code_ends_a_command_with_an_error(scripted_card, monkeypatch):
@@ -122,7 +136,8 @@ def test_record_start_is_never_sent_twice_without_a_stop(scripted_card):
 
 def test_a_refusal_is_an_error_except_that_of_a_stop(scripted_card):
     """A card that does not record refuses to stop."""
-    client, _ = scripted_card(lambda code, _: [reply(code, 1)])
+    refused = 1
+    client, _ = scripted_card(lambda code, _: [reply(code, refused)])
     client.record_stop()
     with expect_refusal(ErrorCode.REFUSED_BY_PEER, "CONFIGURE_FPGA"):
         client.configure(Card())
@@ -137,22 +152,33 @@ def test_the_error_of_a_silent_card_names_it_after_three_requests(scripted_card)
 
 def test_a_command_port_in_use_is_an_error_with_the_command_that_finds_its_user(scripted_card):
     client, _ = scripted_card(lambda *_: [])
-    with expect_refusal(ErrorCode.BUSY, 4202, "ss -ulnp"):
+    with expect_refusal(ErrorCode.BUSY, client.board.command_port, "ss -ulnp"):
         CardClient(client.board, 1.0)
 
 
-@pytest.mark.parametrize("between", [True, False])
-def test_the_end_of_the_previous_record_does_not_end_this_one(scripted_card, between):
-    """The status comes after the stop: before the next start is sent, or between that and its reply."""
-    late = [reply(Code.STATUS, Status.RECORD_COMPLETED)]
-    client, card = scripted_card(
-        lambda code, n: [*(late if between and code == Code.RECORD_START and n == 2 else []), reply(code)]
-    )
+def test_a_late_status_between_the_start_and_its_reply_does_not_end_the_record(scripted_card):
+    """The status is that of the previous record."""
+
+    def answer(code, number):
+        is_second_start = code == Code.RECORD_START and number == 2
+        if is_second_start:
+            return [reply(Code.STATUS, Status.RECORD_COMPLETED), reply(code)]
+        return [reply(code)]
+
+    client, _ = scripted_card(answer)
     client.record_start()
     client.record_stop()
-    if not between:
-        card.say(reply(Code.STATUS, Status.RECORD_COMPLETED | Status.DDR_FULL))
-        assert select.select([client], [], [], HANG_S)[0]
+    client.record_start()
+    assert client.take_status() == NO_STATUS
+
+
+def test_a_late_status_before_the_start_does_not_end_the_record(scripted_card):
+    """The status is that of the previous record; it comes after the stop."""
+    client, card = scripted_card(lambda code, _: [reply(code)])
+    client.record_start()
+    client.record_stop()
+    card.say(reply(Code.STATUS, Status.RECORD_COMPLETED | Status.DDR_FULL))
+    wait_until_readable(client)
     client.record_start()
     assert client.take_status() == NO_STATUS
 
@@ -175,9 +201,19 @@ def test_wait_for_a_completed_record_has_a_timeout(scripted_card):
 
 
 def test_addresses_in_the_eeprom_have_their_last_byte_first():
-    """Host, card, MAC address, and the ports 4200 and 4201."""
-    body = EepromSettings("192.168.33.30", "192.168.33.181", "12:34:56:78:90:13", 4200, 4201).encode()
-    assert body.hex(" ") == "1e 21 a8 c0 b5 21 a8 c0 13 90 78 56 34 12 68 10 69 10"
+    settings = EepromSettings(
+        host_address="192.168.33.30",
+        card_address="192.168.33.181",
+        card_mac="12:34:56:78:90:13",
+        command_port=4200,
+        data_port=4201,
+    )
+    host = "1e 21 a8 c0"
+    card_itself = "b5 21 a8 c0"
+    mac = "13 90 78 56 34 12"
+    # 4200 is 0x1068, and 4201 is 0x1069.
+    ports = "68 10 69 10"
+    assert settings.encode().hex(" ") == f"{host} {card_itself} {mac} {ports}"
 
 
 @given(
@@ -232,7 +268,9 @@ def make_answers(status: int = 0, answer: int = 0):
     def answers(code: int, _: int) -> list[bytes]:
         if code != Code.CONFIGURE_EEPROM:
             return [reply(code)]
-        return [reply(Code.STATUS, status)] * bool(status) + [reply(code, answer)]
+        if status:
+            return [reply(Code.STATUS, status), reply(code, answer)]
+        return [reply(code, answer)]
 
     return answers
 
@@ -265,7 +303,7 @@ def test_a_card_that_could_not_write_its_eeprom_is_not_asked_again(scripted_card
     settings = read_settings(client)
     with expect_refusal(code):
         program_eeprom(client, settings, settings.confirmation)
-    wait_for(lambda: card.seen[1:], "the command")
+    wait_for(lambda: len(card.seen) > 1, "the command")
     assert [code for code, _ in card.seen] == [Code.ALIVE, Code.CONFIGURE_EEPROM]
 
 
@@ -276,7 +314,8 @@ def test_a_late_answer_is_not_taken_for_that_of_a_second_card(scripted_card, mon
     More answers than requests show a second card with the same address.
     """
     client, _ = scripted_card(
-        lambda code, _: [reply(code, 0x0402)] * answers,
+        lambda code, _: [reply(code, VERSION_2_8)] * answers,
+        # The first requests get no answer, and are repeated.
         unanswered=[(Code.VERSION, n) for n in range(1, 1 + repeats)],
     )
     if is_alone:
@@ -289,13 +328,13 @@ def test_a_late_answer_is_not_taken_for_that_of_a_second_card(scripted_card, mon
 
 def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch):
     """Both cards answer one request. The client waits until the second answer comes; one card alone sends none."""
-    names = [board.name for board in rig.boards]
-    cards(*names[1:], **dict.fromkeys(names[2:], Faults(twin=True)))
-    with CardClient(rig.boards[1], HANG_S) as client:
+    _, single_board, twin_board = rig.boards
+    cards(single_board.name, twin_board.name, **{twin_board.name: Faults(twin=True)})
+    with CardClient(single_board, HANG_S) as client:
         client.require_alone()
     monkeypatch.setattr(card, "_TWIN_S", HANG_S)
     with (
-        CardClient(rig.boards[2], HANG_S) as client,
+        CardClient(twin_board, HANG_S) as client,
         expect_refusal(ErrorCode.VALUES_CONFLICT, "2 answers to one request"),
     ):
         client.require_alone()
@@ -320,7 +359,7 @@ def test_a_second_card_of_any_board_is_reported(rig, cards, monkeypatch):
     names = [board.name for board in rig.boards]
     cards(*names, **dict.fromkeys(names, Faults(twin=True)))
     monkeypatch.setattr(card, "_TWIN_S", HANG_S)
-    assert [survey.failed_hop for survey in survey_cards(rig)] == ["card"] * 3
+    assert [survey.failed_hop for survey in survey_cards(rig)] == ["card"] * len(names)
 
 
 def test_mac_addresses_of_cards_are_read_from_the_kernel(tmp_path):

@@ -1,7 +1,9 @@
-"""Every anomaly of a row is counted once, under its own name."""
+"""Every packet of a row that is not as expected (an *anomaly*) is counted once, under its own name."""
+
+import math
 
 from hypothesis import assume, given, strategies as st
-from tests.support.capture.records import FULL, Card, encode_packet, is_original_or_masked, place
+from tests.support.capture.records import FULL, HEADER_BYTES, Card, encode_packet, is_original_or_masked, place
 
 from polysight.capture.dca1000 import Counters, decode_packet_header
 from polysight.capture.placement import EarlierRecords, PacketCounts
@@ -14,8 +16,9 @@ ANOMALIES = ("duplicates", "conflicting", "leftover", "restarted", "outside", "d
 
 
 def list_other_anomalies(counts: PacketCounts, *names: str) -> dict[str, int]:
-    """Return the anomalies that were counted, without these."""
-    return {name: n for name in ANOMALIES if name not in names and (n := getattr(counts, name))}
+    """Return the anomalies that were counted, except those with these names."""
+    other_counts = {name: getattr(counts, name) for name in ANOMALIES if name not in names}
+    return {name: count for name, count in other_counts.items() if count}
 
 
 @given(
@@ -28,7 +31,7 @@ def list_other_anomalies(counts: PacketCounts, *names: str) -> dict[str, int]:
 def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start, rows, cut, batch):
     frame, frames = grid
     size = frame * frames
-    packets = -(-size // FULL)
+    packets = math.ceil(size / FULL)
     assume(packets > 2)
     # Neither the first nor the last packet.
     restart_packet = 1 + int(cut * (packets - 2))
@@ -41,17 +44,21 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
     record = card.record(resets=(restart_packet,))
     placed, out = place(size, record.packets, past, frame, batch)
     assert is_original_or_masked(record, placed, out)
-    assert (placed.counts.placed, placed.counts.restarted) == (restart_packet, packets - restart_packet), placed.reason
+    assert placed.counts.placed == restart_packet, placed.reason
+    assert placed.counts.restarted == packets - restart_packet, placed.reason
     assert not list_other_anomalies(placed.counts, "restarted")
     assert not placed.located
 
 
 @given(at=st.integers(2, 85), lost=st.sampled_from([1, 2, 5]))
 def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_arrival(at, lost):
-    """The counters started again twice, so that nothing shows which bytes follow which."""
+    """The card is reset before packet `at`, and the last `lost` packets are lost.
+
+    The counters started at 0 and 1 twice, so that nothing shows which bytes follow which.
+    """
     size = 91 * 4096
     record = Card(size).record(resets=(at,))
-    placed, _ = place(size, record.packets[: len(record.packets) - lost], Counters(0, 1), 4096)
+    placed, _ = place(size, record.packets[:-lost], Counters(0, 1), frame=4096)
     assert not placed.located
     assert not placed.slipped
 
@@ -69,29 +76,31 @@ def test_frames_of_a_row_with_conflicts_are_not_moved():
 
     # Packet 9 comes once more, with the bytes of packet 8.
     packets = Card(size - frame, 70_000, 9).record().packets
-    row_with_conflict, _ = place(size, [*packets, packets[9][:10] + packets[8][10:]], start, frame)
+    conflicting_packet = packets[9][:HEADER_BYTES] + packets[8][HEADER_BYTES:]
+    row_with_conflict, _ = place(size, [*packets, conflicting_packet], start, frame)
     assert not row_with_conflict.slipped
     assert row_with_conflict.holes == [(9 * FULL, 10 * FULL)]
 
 
 def spoil_packet(packets: list[bytes], kind: str, k: int) -> list[bytes]:
     """Return the packets of a row with one anomaly after packet k."""
-    head = packets[k][:10]
-    payload = packets[k][10:]
-    extra = {
+    head = packets[k][:HEADER_BYTES]
+    sequence_number = packets[k][:4]
+    byte_count = packets[k][4:HEADER_BYTES]
+    payload = packets[k][HEADER_BYTES:]
+    last_sequence, last_count = decode_packet_header(packets[-1])
+    end_count = last_count + len(packets[-1]) - HEADER_BYTES
+    extra_packets = {
         "duplicates": packets[k],
         "conflicting": head + payload[::-1],
-        "outside": encode_packet(*end_state(packets[-1]), bytes(FULL)),
-        "disagreeing": head[:4] + bytes(x ^ 0x55 for x in head[4:10]) + payload,
+        # A packet that follows the last one.
+        "outside": encode_packet(last_sequence + 1, end_count, bytes(FULL)),
+        # Every second bit of the byte count is inverted.
+        "disagreeing": sequence_number + bytes(byte ^ 0x55 for byte in byte_count) + payload,
+        # A header without payload.
         "malformed": head,
-    }[kind]
-    return [*packets[: k + 1], extra, *packets[k + 1 :]]
-
-
-def end_state(packet: bytes) -> tuple[int, int]:
-    """Return the sequence number and byte count that follow a packet."""
-    sequence, count = decode_packet_header(packet)
-    return sequence + 1, count + len(packet) - 10
+    }
+    return [*packets[: k + 1], extra_packets[kind], *packets[k + 1 :]]
 
 
 @given(
@@ -105,10 +114,10 @@ def test_an_anomaly_is_counted_once_and_under_its_name(grid, kind, where, batch)
     size = frame * frames
     start = Counters(145_600_123, 100_001)
     card = Card(size, start.byte_count, start.sequence)
-    past = place(size, card.record().packets, start, frame, batch)[0].past
+    first_row, _ = place(size, card.record().packets, start, frame, batch)
     record = card.record()
     k = int(where * (len(record.packets) - 1))
-    placed, out = place(size, spoil_packet(record.packets, kind, k), past, frame, batch)
+    placed, out = place(size, spoil_packet(record.packets, kind, k), first_row.past, frame, batch)
     assert is_original_or_masked(record, placed, out)
     assert getattr(placed.counts, kind) == 1
     assert not list_other_anomalies(placed.counts, kind)
@@ -121,13 +130,14 @@ def test_late_packets_of_the_record_before_are_left_over(grid, lost_packets, bat
     size = frame * frames
     start = Counters(145_600_123, 100_001)
     card = Card(size, start.byte_count, start.sequence)
-    past = place(size, card.record().packets, start, frame, batch)[0].past
+    first_row, _ = place(size, card.record().packets, start, frame, batch)
     earlier_record = card.record()
-    lost_packets = min(lost_packets, len(earlier_record.packets) - 1)
-    past = place(size, earlier_record.packets[lost_packets:], past, frame, batch)[0].past
+    late = min(lost_packets, len(earlier_record.packets) - 1)
+    late_packets = earlier_record.packets[:late]
+    earlier_row, _ = place(size, earlier_record.packets[late:], first_row.past, frame, batch)
     record = card.record()
-    mixed = [*record.packets[:2], *earlier_record.packets[:lost_packets], *record.packets[2:]]
-    placed, _ = place(size, mixed, past, frame, batch)
+    packets = [*record.packets[:2], *late_packets, *record.packets[2:]]
+    placed, _ = place(size, packets, earlier_row.past, frame, batch)
     assert placed.complete
-    assert placed.counts.leftover == lost_packets
+    assert placed.counts.leftover == len(late_packets)
     assert not list_other_anomalies(placed.counts, "leftover")

@@ -10,8 +10,8 @@ from polysight.capture import receiver
 from polysight.capture.receiver import Began, BeginRow, Progress, ReceiverProcess
 from polysight_shared.errors import ErrorCode
 
-REQUEST = BeginRow(0, 1, 4096, 4096, "a.part")
-PROGRESS = Progress(0, 1, 0, complete=False, last_arrival_ns=0)
+REQUEST = BeginRow(row=0, take=1, expected_bytes=4096, frame_bytes=4096, path="a.part")
+PROGRESS = Progress(row=0, take=1, received=0, complete=False, last_arrival_ns=0)
 
 
 class Process:
@@ -44,9 +44,11 @@ class Process:
 
 
 def test_progress_that_comes_before_the_answer_is_noted(monkeypatch):
-    process = Process([PROGRESS, PROGRESS, Began(3)], monkeypatch)
-    assert process.ask(5.0) == Began(3)
-    assert process.noted == [PROGRESS, PROGRESS, Began(3)]
+    began = Began(stale=3)
+    process = Process([PROGRESS, PROGRESS, began], monkeypatch)
+    assert process.ask(timeout_s=5.0) == began
+    assert process.noted == [PROGRESS, PROGRESS, began]
+    # Each answer takes a second of the timeout.
     assert process.limits_s == [5.0, 4.0, 3.0]
 
 

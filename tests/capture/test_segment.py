@@ -1,14 +1,18 @@
-"""A row's file: reused memory, a full disk, a damaged index."""
+"""The packets of a row in memory (`PacketLog`), and the row's file: reused memory, a full disk, a damaged index."""
 
 import zlib
 
 import numpy as np
 import pytest
+from tests.support.capture.records import FULL, HEADER_BYTES
 from tests.support.refusals import expect_refusal
 
 from polysight.capture.dca1000 import PacketLog
 from polysight.capture.row_files import Segment, read_index
 from polysight_shared.errors import DataError, DeviceError, ErrorCode
+
+# Bytes: 1 EiB.
+MORE_THAN_ANY_DISK = 1 << 60
 
 
 def test_the_memory_of_an_earlier_row_is_used_again_and_cleared():
@@ -25,10 +29,12 @@ def test_the_memory_of_an_earlier_row_is_used_again_and_cleared():
 def test_payload_stays_in_its_memory_until_that_is_full():
     log = PacketLog(1024)
     memory = log.payload
-    count = memory.size // 1024
-    assert count * 1024 == memory.size
-    packets = np.random.default_rng(0).integers(0, 256, (count + 1, 10 + 1024), dtype=np.uint8)
-    lengths = np.full(count + 1, 10 + 1024)
+    payload_bytes = 1024
+    packet_bytes = HEADER_BYTES + payload_bytes
+    packets_that_fit = memory.size // payload_bytes
+    assert packets_that_fit * payload_bytes == memory.size
+    packets = np.random.default_rng(0).integers(0, 256, (packets_that_fit + 1, packet_bytes), dtype=np.uint8)
+    lengths = np.full(len(packets), packet_bytes)
     assert log.last_arrival_ns == 0
     log.add(packets[:-2], lengths[:-2], 3)
     log.add(packets[-2:-1], lengths[-2:-1], 5)
@@ -37,29 +43,37 @@ def test_payload_stays_in_its_memory_until_that_is_full():
     log.add(packets[-1:], lengths[-1:], 7)
     assert log.payload is not memory
     assert log.last_arrival_ns == 7
-    assert (log.payload[: packets[:, 10:].size] == packets[:, 10:].ravel()).all()
+    payload = packets[:, HEADER_BYTES:].ravel()
+    assert (log.payload[: payload.size] == payload).all()
 
 
 def log_packets(*sizes: int, expected: int = 9000) -> PacketLog:
-    """Return a log of packets with so many bytes of payload, that of each filled with its number."""
+    """Return a log of packets whose payloads have these sizes; every byte of packet k, which comes at k ns, is k."""
     log = PacketLog(expected)
     for number, size in enumerate(sizes):
-        packet = np.full((1, 10 + size), number % 256, np.uint8)
-        log.add(packet, np.array([10 + size]), number)
+        packet = np.full((1, HEADER_BYTES + size), number % 256, np.uint8)
+        log.add(packet, np.array([HEADER_BYTES + size]), number)
     return log
 
 
 def test_a_packet_has_at_least_one_byte_and_at_most_1456():
-    log = log_packets(0, 1, 1456, 1457)
+    log = log_packets(0, 1, FULL, FULL + 1)
     assert log.malformed == 2
-    assert log.sizes.tolist() == [1, 1456]
-    assert log.payload_bytes == 1457
+    assert log.sizes.tolist() == [1, FULL]
+    assert log.payload_bytes == 1 + FULL
     assert log.arrivals_ns.tolist() == [1, 2]
-    assert log.payload[:1457].tolist() == [1] + 1456 * [2]
-    joined = PacketLog(9000)
-    # Nine bytes are less than a header.
-    joined.add(np.zeros((4, 12), np.uint8), np.array([10, 12, 9, 11]), np.array([5, 6, 7, 8]))
-    assert (joined.malformed, joined.sizes.tolist(), joined.arrivals_ns.tolist()) == (2, [2, 1], [6, 8])
+    assert log.payload[: 1 + FULL].tolist() == [1] + FULL * [2]
+
+
+def test_malformed_packets_of_a_batch_are_left_out_of_its_sizes_and_times():
+    # A header alone, two bytes more, less than a header, and one byte more than a header.
+    lengths = [HEADER_BYTES, HEADER_BYTES + 2, HEADER_BYTES - 1, HEADER_BYTES + 1]
+    times_ns = [5, 6, 7, 8]
+    log = PacketLog(9000)
+    log.add(np.zeros((4, max(lengths)), np.uint8), np.array(lengths), np.array(times_ns))
+    assert log.malformed == 2
+    assert log.sizes.tolist() == [2, 1]
+    assert log.arrivals_ns.tolist() == [6, 8]
 
 
 @pytest.mark.parametrize(
@@ -83,17 +97,25 @@ def test_payload_of_far_more_than_a_row_is_counted_and_not_kept():
     log = PacketLog(0)
     largest_bytes = PacketLog.max_kept_bytes(0)
     assert largest_bytes == 4 << 20
-    packets = np.zeros((1024, 10 + 1024), np.uint8)
-    lengths = np.full(1024, 10 + 1024)
+    payload_bytes = 1024
+    packets = np.zeros((1024, HEADER_BYTES + payload_bytes), np.uint8)
+    lengths = np.full(1024, HEADER_BYTES + payload_bytes)
+    # Four batches of 1024 packets are 4 MiB.
+    packets_that_fit = 4 * 1024
     for _ in range(4):
         log.add(packets, lengths, 0)
-    assert log.kept == log.count == 4096
+    assert log.kept == packets_that_fit
+    assert log.count == packets_that_fit
     assert log.payload.size <= largest_bytes
     log.add(packets[:1], lengths[:1], 0)
-    assert (log.kept, log.count, log.payload_bytes) == (4096, 4097, largest_bytes + 1024)
+    assert log.kept == packets_that_fit
+    assert log.count == packets_that_fit + 1
+    assert log.payload_bytes == largest_bytes + payload_bytes
     # A packet after one that was not kept is not kept either, however small.
-    log.add(packets[:1, :11], np.array([11]), 0)
-    assert (log.kept, log.count) == (4096, 4098)
+    smallest_packet_bytes = HEADER_BYTES + 1
+    log.add(packets[:1, :smallest_packet_bytes], np.array([smallest_packet_bytes]), 0)
+    assert log.kept == packets_that_fit
+    assert log.count == packets_that_fit + 2
 
 
 def test_a_log_is_restored_from_its_arrays():
@@ -119,10 +141,11 @@ def test_a_segment_holds_the_bytes_given(tmp_path):
 
 def test_a_row_for_which_the_disk_has_no_space_is_refused(tmp_path):
     with expect_refusal(ErrorCode.DISK_FULL):
-        Segment(tmp_path / "huge.part", 1 << 60)
+        Segment(tmp_path / "huge.part", MORE_THAN_ANY_DISK)
 
 
 def test_damaged_index_is_refused(tmp_path):
+    # An arrival has 16 bytes. The last two contents have one arrival too few, and one that was cut.
     for raw in (b"", b"[]\n", b'{"arrivals":2}\n' + bytes(16), b'{"arrivals":1}\n' + bytes(15)):
         (tmp_path / "a.idx").write_bytes(raw)
         with pytest.raises(DataError):
@@ -137,5 +160,5 @@ def test_the_commands_advised_for_a_damaged_or_unwritten_row_have_the_scan_folde
         read_index(index)
     assert f"polysight validate {tmp_path / 'scan'}`" in damaged.value.remedy
     with pytest.raises(DeviceError) as full:
-        Segment(index.with_suffix(".part"), 1 << 60)
+        Segment(index.with_suffix(".part"), MORE_THAN_ANY_DISK)
     assert f"polysight resume {tmp_path / 'scan'}`" in full.value.remedy

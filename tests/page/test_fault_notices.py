@@ -35,7 +35,7 @@ def test_a_fault_that_ends_a_row_alone_is_a_warning_and_others_are_errors(fault)
     assert notice.level == expected
     assert notice.what == f"Fault {int(fault)} at the Pi: {explain(fault).problem}"
     assert notice.facts == {}
-    assert notice.why == "" or notice.why[0] == notice.why[0].upper()
+    assert not notice.why[:1].islower()
 
 
 def test_a_notice_has_the_events_own_words_before_those_of_the_table():
@@ -57,8 +57,12 @@ def test_the_cause_of_several_faults_is_that_of_the_first_known_one():
     unknown = RowFault(kind="of a later release", board="", number=0)
     without_number = RowFault(kind="pi_fault", board="", number=0)
     cause_of_stage = capitalise(explain(PiFault.STAGE_LOST).cause)
-    assert _find_cause([stage, silent])[0] == cause_of_stage
-    cause_of_silence = _find_cause([silent])[0]
+    cause, _ = _find_cause([stage, silent])
+    assert cause == cause_of_stage
+    cause_of_silence, _ = _find_cause([silent])
     assert cause_of_silence not in ("", cause_of_stage)
-    assert _find_cause([unknown, without_number, silent, stage])[0] == cause_of_silence
-    assert _find_cause([unknown]) == _find_cause([]) == ("", "")
+    cause, _ = _find_cause([unknown, without_number, silent, stage])
+    assert cause == cause_of_silence
+    no_cause_and_no_remedy = ("", "")
+    assert _find_cause([unknown]) == no_cause_and_no_remedy
+    assert _find_cause([]) == no_cause_and_no_remedy

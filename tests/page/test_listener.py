@@ -23,7 +23,7 @@ COMMON = {"scan_id": "mine", "t_mono_ns": 1}
 
 @pytest.fixture
 def pi(tmp_path):
-    """A function that sends events as the Pi does, and a listener that has heard from it."""
+    """A function that sends events as the Pi does, and a listener that has received some."""
     context = make_server_context()
     events = create_publisher(context, "tcp://127.0.0.1:*", tmp_path)
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)

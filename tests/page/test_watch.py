@@ -23,7 +23,7 @@ from polysight.store import manifest
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 
-# Time after which a program without a sign of life counts as ended: so long that no test reaches it
+# Time after which a program without a sign of life counts as ended, so long that no test reaches it.
 NEVER_LAPSES_S = 1e6
 
 
@@ -33,12 +33,18 @@ def read_state(watch: Watch) -> dict:
 
 
 def has_rows(rows: int):
-    return lambda state: (state.get("pictures") or {}).get("rows") == rows
+    """Function that is true of a state whose pictures have so many rows."""
+
+    def has_these_rows(state: dict) -> bool:
+        pictures = state.get("pictures")
+        return pictures is not None and pictures["rows"] == rows
+
+    return has_these_rows
 
 
 @pytest.fixture(scope="module")
 def truth(finished_scan):
-    """Pictures of the finished folder, by the instrument's own pipeline."""
+    """The finished scan, its pipeline, and the pictures of the pipeline's images."""
     scan = ScanFolder.load(finished_scan)
     pipeline = Pipeline(scan, live=True)
     for row in scan.rows():
@@ -67,7 +73,9 @@ def test_a_finished_folder_is_shown_unchanged(finished_scan, truth, watching):
         summary = pipeline.quality.boards[board["name"]].summary()
         assert board["frames_received"] == summary.frames_received
         assert board["masked"] == summary.positions_masked
-    assert {name: p.png for name, p in watch.shown.pictures.items()} == {n: p.png for n, p in pictures.items()}
+    assert watch.shown.pictures.keys() == pictures.keys()
+    for name, picture in pictures.items():
+        assert watch.shown.pictures[name].png == picture.png, name
     picture_names = {f"{channel}_{part}" for channel in "hvp" for part in ("amplitude", "phase")}
     assert set(state["pictures"]["scales"]) == picture_names
     assert state["profile"]["row"] == 2
@@ -88,7 +96,8 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
         growing.grow_until("row_committed")
         watch.wait_for(has_rows(row + 1))
         state = read_state(watch)
-        assert state["scan"]["marks"] == "c" * (row + 1) + "." * (2 - row)
+        committed = row + 1
+        assert state["scan"]["marks"] == "c" * committed + "." * (3 - committed)
         assert state["pictures"]["revision"] > revision
         assert state["profile"]["row"] == row
         revision = state["pictures"]["revision"]
@@ -207,7 +216,7 @@ def test_a_file_that_grows_in_any_pieces_gives_all_its_facts(finished_scan, tmp_
         all_facts = manifest.parse(raw).facts
     else:
         all_facts = read_events(finished_scan / name).events
-    # There is something to cut.
+    # The file is long enough to be cut into several pieces.
     assert len(all_facts) > 4
 
     @settings(max_examples=20)
@@ -245,7 +254,7 @@ def test_another_file_in_its_place_is_read_from_the_beginning(finished_scan, tmp
 
 
 def test_another_and_longer_file_is_found_after_a_single_look(finished_scan, tmp_path):
-    """The file was replaced before anything was appended to the one that was read."""
+    """The file was read once, and then replaced by another before anything was appended to it."""
     path = tmp_path / MANIFEST
     raw = (finished_scan / MANIFEST).read_bytes()
     other_items = [{"fact": "scan_ended", "reason": "another scan" * 50} for _ in raw.splitlines()]

@@ -15,14 +15,16 @@ from tests.support.scenes import make_scene
 from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
-from polysight.jobs import batch, batch as many
+from polysight.jobs import batch
 from polysight.process import count_cores
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import ScanFolder, drop
-from polysight_shared.errors import ErrorCode
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
+# Exit status of a batch in which a scan failed
+A_SCAN_FAILED = 1
 # Program in place of the one that processes a scan: it ends as the name of the scan says. Jobs are plain data, so that
 # it does not import the host's program, which takes seconds.
 WORKER = """
@@ -62,7 +64,7 @@ def worker(tmp_path, monkeypatch):
     """Use WORKER as the program that processes a scan."""
     file = tmp_path / "worker.py"
     file.write_text(WORKER)
-    monkeypatch.setattr(many, "WORKER_COMMAND", (sys.executable, str(file)))
+    monkeypatch.setattr(batch, "WORKER_COMMAND", (sys.executable, str(file)))
 
 
 def make_scans(folder, *names):
@@ -113,11 +115,11 @@ def test_a_failing_scan_stops_no_other_and_a_second_run_processes_unfinished_sca
 
 
 @pytest.mark.usefixtures("worker")
-def test_a_program_that_was_killed_after_its_mark_has_finished_its_scan(tmp_path):
-    """The mark is the last file that the program writes."""
+def test_a_program_that_was_killed_after_its_last_file_has_finished_its_scan(tmp_path):
+    """The last file, `.finished.json`, marks a scan as finished."""
     make_scans(tmp_path / "in", "late")
     (job,) = make_jobs(tmp_path / "in", "late")
-    assert many.run_scan(job).status == "done"
+    assert batch.run_scan(job).status == "done"
 
 
 @pytest.mark.usefixtures("worker")
@@ -199,11 +201,11 @@ def read_raw_digests(folder):
 def test_when_a_batch_ends_early_its_programs_end_too(tmp_path):
     make_scans(tmp_path / "in", "slow", "slow2")
     todo = make_jobs(tmp_path / "in", "slow", "slow2")
-    results = many.run_here(todo, 2)
+    results = batch.run_here(todo, 2)
     # WORKER sleeps for "slow" only.
     first = next(results)
     assert (first.name, first.status) == ("slow2", "done")
-    # Waits for the program: if it were not ended the test would take the 600 s of its sleep.
+    # Ends the program of the other scan and waits for it. Without an end it would sleep for 600 s.
     results.close()
     assert not batch.is_finished(todo[0])
 
@@ -230,7 +232,7 @@ def test_as_many_scans_are_processed_together_as_cores_and_memory_allow():
     assert batch.fit_scans(70_000, cores=8, free_bytes=100 * needed_bytes) == 8
     assert batch.fit_scans(70_000, cores=8, free_bytes=3 * needed_bytes) == 2
     assert batch.fit_scans(70_000, cores=8, free_bytes=0) == 1
-    assert many.free_memory_bytes() > 0
+    assert batch.free_memory_bytes() > 0
     assert count_cores() >= 1
 
 
@@ -239,7 +241,11 @@ def test_the_table_names_every_scan_and_counts(tmp_path):
     (tmp_path / "a" / "quality.json").write_text('{"boards": {"RH": {"positions": 200, "positions_masked": 3}}}')
     (tmp_path / "a" / "materials.json").write_text('{"segments": [{"label": 1}, {"label": 2}]}')
     text = batch.format_table(
-        [batch.Outcome("a", "done", 61.0, 0.54), batch.Outcome("b", "failed", 2.0, 0.0, "broken")], tmp_path
+        [
+            batch.Outcome("a", "done", seconds=61.0, memory_gb=0.54),
+            batch.Outcome("b", "failed", seconds=2.0, memory_gb=0.0, message="broken"),
+        ],
+        tmp_path,
     )
     head, a, b, end = text.splitlines()
     assert head.split() == ["scan", "result", "seconds", "memory", "masked", "patches"]
@@ -252,13 +258,15 @@ def test_the_table_names_every_scan_and_counts(tmp_path):
 def test_a_wrong_folder_fails_and_the_exit_status_shows_it(tmp_path, capsys):
     make_scans(tmp_path / "in", "a", "bad")
     command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
-    assert main([*command, "--jobs", "1"]) == 1
+    assert main([*command, "--jobs", "1"]) == A_SCAN_FAILED
     assert "2 scans: 1 done, 1 failed" in capsys.readouterr().out
     # A single scan is processed by this program, and its error is not that of a batch.
-    assert main([*command[:2], "--out", str(tmp_path / "one")]) != 0
+    single = ["process", str(tmp_path / "in" / "a")]
+    assert main([*single, "--out", str(tmp_path / "one")]) != 0
     assert "out/one" not in capsys.readouterr().out
     (tmp_path / "file").touch()
-    assert main([*command[:3], "--out", str(tmp_path / "file")]) == 2
+    both = [*single, str(tmp_path / "in" / "bad")]
+    assert main([*both, "--out", str(tmp_path / "file")]) == ConfigError.exit_status
 
 
 def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatch, capsys):
@@ -266,7 +274,7 @@ def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
     make_scans(tmp_path / "in", "a")
     command = ["process", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--dask", "tcp://127.0.0.1:1"]
-    assert main(command) == 2
+    assert main(command) == ConfigError.exit_status
     assert "pip install distributed" in capsys.readouterr().err
 
 
@@ -283,15 +291,15 @@ def test_a_dask_cluster_does_the_same(tmp_path):
     assert [o.status for o in outcomes] == ["done", "failed", "done"]
     assert all(batch.is_finished(j) == (j.name != "bad") for j in todo)
     with expect_refusal(ErrorCode.NO_ANSWER):
-        list(many.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
+        list(batch.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
 
 
 @pytest.mark.usefixtures("worker")
-def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
-    """A Dask worker that is killed after the mark has its scan sent to another one."""
+def test_a_scan_that_is_marked_as_finished_is_done_and_not_processed_again(tmp_path):
+    """If a Dask worker is killed after it has finished a scan, the scan is sent to another worker."""
     make_scans(tmp_path / "in", "a")
     (job,) = make_jobs(tmp_path / "in", "a")
-    assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3
+    assert [batch.run_scan(job).status for _ in range(3)] == ["done"] * 3
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\n"
     second_run = batch.process_many([job], tmp_path / "out", 1, again=True)
     assert [o.status for o in second_run] == ["done"]
@@ -364,7 +372,7 @@ def test_the_real_program_processes_a_simulated_scan_and_refuses_a_damaged_one(t
     broken.mkdir()
     (broken / "data_collection_cfg.json").write_text("{")
     command = ["process", str(tmp_path / "unsynced"), "--out", str(tmp_path / "out")]
-    assert main(command) == 1
+    assert main(command) == A_SCAN_FAILED
     output = capsys.readouterr().out
     assert "broken  failed" in output
     assert "not JSON" in output

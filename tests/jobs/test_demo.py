@@ -2,6 +2,7 @@
 
 import contextlib
 import re
+import signal
 import time
 
 import pytest
@@ -9,11 +10,18 @@ from tests.support.paths import REPO
 
 from polysight.jobs import demo
 from polysight.results import NoResult
+from polysight_shared.errors import ConfigError
 
 
 @pytest.mark.parametrize(
     ("status", "exit_status", "names_logs"),
-    [(0, 0, False), (NoResult.exit_status, NoResult.exit_status, False), (2, 2, True), (-9, 9, True)],
+    [
+        (0, 0, False),
+        (NoResult.exit_status, NoResult.exit_status, False),
+        (ConfigError.exit_status, ConfigError.exit_status, True),
+        # A program that a signal has ended has the negative number of the signal as its status.
+        (-signal.SIGKILL, signal.SIGKILL, True),
+    ],
 )
 def test_a_demo_names_the_logs_of_the_rig_if_its_scan_failed(
     monkeypatch, tmp_path, capsys, status, exit_status, names_logs

@@ -7,13 +7,14 @@ import pytest
 from polysight.cli.main import main
 from polysight.jobs import recordings, scans, train
 from polysight.store import MANIFEST
+from polysight_shared.errors import ConfigError, DataError, DeviceError
 
 
 class WorkedError(Exception):
     """Raised in place of the work of a command."""
 
 
-# Commands with the option that names a file to write; the name comes last.
+# Commands up to the option that names a file to write; tests add the name.
 COMMANDS = {
     "train": ["train", "--simulate", "examples/library", "--out"],
     "train --authors": ["train", "--authors", "authors", "--out"],
@@ -23,6 +24,8 @@ COMMANDS = {
     "doctor": ["doctor", "--config", "none.toml", "--bundle"],
 }
 PICTURES = ("compare", "check", "inspect")
+# Exit statuses with which these commands refuse a file: wrong usage, wrong data, or an error of the system
+REFUSALS = (ConfigError.exit_status, DataError.exit_status, DeviceError.exit_status)
 
 
 @pytest.fixture(autouse=True)
@@ -49,8 +52,7 @@ def replace_work(monkeypatch, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("name", ["folder.png", "file/x.png"])
 def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, command, name):
-    # The exit status depends on the command: wrong usage, wrong data, or an error of the system.
-    assert main([*COMMANDS[command], str(tmp_path / name)]) in (2, 3, 5)
+    assert main([*COMMANDS[command], str(tmp_path / name)]) in REFUSALS
     assert name.partition("/")[0] in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
 
@@ -70,7 +72,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, caps
 )
 @pytest.mark.parametrize("name", ["file", "file/x"])
 def test_a_folder_that_cannot_be_made_is_refused_before_the_data_are_read(tmp_path, capsys, command, name):
-    assert main([*command.split(), "--out", str(tmp_path / name)]) == 5
+    assert main([*command.split(), "--out", str(tmp_path / name)]) == DeviceError.exit_status
     message = capsys.readouterr().err
     assert f"{tmp_path / 'file'}: Not a directory" in message
     assert "a file has the name of a folder" in message
@@ -81,7 +83,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_data_are_read(tmp_pa
 def test_a_picture_whose_name_does_not_end_in_png_is_refused(tmp_path, capsys, command, name):
     with pytest.raises(SystemExit) as ended:
         main([*COMMANDS[command], str(tmp_path / name)])
-    assert ended.value.code == 2
+    assert ended.value.code == ConfigError.exit_status
     assert "does not end in .png" in capsys.readouterr().err
 
 
@@ -99,6 +101,6 @@ def test_results_are_not_written_among_recorded_rows(tmp_path, capsys, command):
     scan = tmp_path / "scan"
     scan.mkdir()
     (scan / MANIFEST).touch()
-    assert main([command, str(scan), "--out", str(scan)]) == 2
+    assert main([command, str(scan), "--out", str(scan)]) == ConfigError.exit_status
     assert "recorded rows" in capsys.readouterr().err
     assert [path.name for path in scan.iterdir()] == [MANIFEST]

@@ -50,13 +50,15 @@ def test_patches_get_names_by_their_numbers(products, capsys):
     output = capsys.readouterr().out
     named_boxes = load_boxes(products)
     assert list(named_boxes.boxes) == ["copper", "\u6a61\u6728"]
-    assert (named_boxes.unit, named_boxes.metal, named_boxes.by_hand) == ("mm", "copper", True)
+    assert (named_boxes.unit, named_boxes.metal) == ("mm", "copper")
+    assert named_boxes.by_hand
     # 9 mm inside the patch, which is x -50 to -20 mm and y -20 to 20 mm.
     assert named_boxes.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))
     assert "left out, without a name: 3" in output
     assert "\u6a61\u6728" in output
     assert (products / "labels.png").read_bytes().startswith(b"\x89PNG")
-    assert find_labels(products)[1] == named_boxes
+    _, found_boxes = find_labels(products)
+    assert found_boxes == named_boxes
 
 
 def test_boxes_are_drawn_moved_renamed_and_removed(products):
@@ -75,7 +77,9 @@ def test_boxes_are_drawn_moved_renamed_and_removed(products):
 
 def test_a_patch_declared_as_metal_is_named_metal(products):
     assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "2=oak"]) == 0
-    assert (list(load_boxes(products).boxes), load_boxes(products).metal) == (["metal", "oak"], "metal")
+    named_boxes = load_boxes(products)
+    assert list(named_boxes.boxes) == ["metal", "oak"]
+    assert named_boxes.metal == "metal"
     assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "1=x", "--rename", "2=oak"]) == 0
     assert load_boxes(products).metal == "x"
 
@@ -127,12 +131,14 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert "named PET 80 %" in questions[1]
     # Two names that differ only in capitals are reported.
     assert "the name pet" in capsys.readouterr().out
-    assert label(products, Edits(), ask=script_answers("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
+    ask, _ = script_answers("yes", "oak", "glass", "", "nothing", "glass")
+    assert label(products, Edits(), ask=ask) == 0
     assert load_boxes(products).metal == "glass"
     labels_before = (products / "labels.json").read_bytes()
     for answers, code in ((["no"], ErrorCode.VALUE_INVALID), (["yes", "copper"], ErrorCode.KEY_MISSING)):
+        ask, _ = script_answers(*answers)
         with expect_refusal(code):
-            label(products, Edits(), ask=script_answers(*answers)[0])
+            label(products, Edits(), ask=ask)
     assert (products / "labels.json").read_bytes() == labels_before
 
 

@@ -11,12 +11,13 @@ from polysight.settings import DEFAULT
 from polysight_shared.errors import ConfigError, ErrorCode
 
 
-def process_last_row(tmp_path, monkeypatch, code: ErrorCode | None, complete: bool = True) -> int:
-    """Add the row of a scan; return how often its images were written, which fails with `code`."""
-    written = []
+def process_row(tmp_path, monkeypatch, code: ErrorCode | None, complete: bool = True) -> int:
+    """Add a row, the last one if `complete`; return how often images were written. Writing fails with `code`."""
+    calls = 0
 
     def publish_images(*_: Any) -> None:
-        written.append(1)
+        nonlocal calls
+        calls += 1
         if code is not None:
             raise ConfigError("no images", "try", "again", code=code)
 
@@ -27,19 +28,20 @@ def process_last_row(tmp_path, monkeypatch, code: ErrorCode | None, complete: bo
     live._pipeline = pipeline
     live._source = source
     live.add_row(0)
-    return len(written)
+    return calls
 
 
 @pytest.mark.parametrize("complete", [True, False])
-def test_images_are_written_after_the_last_row_alone(tmp_path, monkeypatch, complete):
-    assert process_last_row(tmp_path, monkeypatch, None, complete) == complete
+def test_images_are_written_only_after_the_last_row(tmp_path, monkeypatch, complete):
+    no_error = None
+    assert process_row(tmp_path, monkeypatch, no_error, complete) == (1 if complete else 0)
 
 
-def test_products_that_another_program_is_writing_are_waited_for_later(tmp_path, monkeypatch):
-    assert process_last_row(tmp_path, monkeypatch, ErrorCode.BUSY) == 1
+def test_images_that_another_program_is_writing_cause_no_error(tmp_path, monkeypatch):
+    assert process_row(tmp_path, monkeypatch, ErrorCode.BUSY) == 1
 
 
 @pytest.mark.parametrize("code", [code for code in ErrorCode if code is not ErrorCode.BUSY])
 def test_any_other_error_of_writing_images_is_raised(tmp_path, monkeypatch, code):
     with pytest.raises(ConfigError):
-        process_last_row(tmp_path, monkeypatch, code)
+        process_row(tmp_path, monkeypatch, code)

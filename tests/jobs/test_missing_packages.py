@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from polysight.cli.main import main
+from polysight_shared.errors import ConfigError
 
 COMMANDS = {
     "simulate examples/point-targets.toml --out out": "polysight_simulators",
@@ -24,7 +25,7 @@ def test_a_missing_package_is_named(
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.chdir(tmp_path)
-    assert main(command.split()) == 2
+    assert main(command.split()) == ConfigError.exit_status
     message = capsys.readouterr().err
     assert f"the package {package} is not installed" in message
     assert "pip install" in message

@@ -21,7 +21,7 @@ from polysight.cli.main import build_parser, main
 from polysight.jobs import scans
 from polysight.results import ComplexNumber
 from polysight.store import MANIFEST, manifest
-from polysight_shared.errors import DataError, ErrorCode
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 from polysight_simulators.scene import decode_scene, simulate
 
 
@@ -50,9 +50,9 @@ def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
     assert {row["name"]: row["state"] for row in rows} == {"one": "finished", "two": "products"}
     # The size is that of a scan's files.
     assert all(row["bytes"] > 1000 for row in rows)
-    for words, names in ((["--tag", "oak"], {"one"}), (["--find", "BRETT"], {"one"}), (["--find", "pet"], {"two"})):
-        document = json.loads(run_command(capsys, "scans", root, "--json", *words))["scans"]
-        assert {r["name"] for r in document} == names
+    for option, value, name in (("--tag", "oak", "one"), ("--find", "BRETT", "one"), ("--find", "pet", "two")):
+        rows = json.loads(run_command(capsys, "scans", root, "--json", option, value))["scans"]
+        assert [row["name"] for row in rows] == [name]
     assert "2 scans" in run_command(capsys, "scans", root)
 
 
@@ -73,18 +73,20 @@ def test_a_command_reaches_a_running_scan_and_is_refused_without_one(root, capsy
     with open_control(root / "one") as stop:
         assert "pause" in run_command(capsys, "ask", root / "one", "pause")
         assert stop.paused
-    assert main(["ask", str(root / "one"), "pause"]) == 6
+    assert main(["ask", str(root / "one"), "pause"]) == ScanError.exit_status
     assert "polysight resume" in capsys.readouterr().err
 
 
 def test_results_at_a_place_and_of_two_scans_are_printed(root, capsys, tmp_path):
     text = run_command(capsys, "probe", root / "two", "0,0")
     assert "|H|" in text
-    assert json.loads(run_command(capsys, "probe", root / "two", "0,0", "--json"))["referenced"] is True
+    place = json.loads(run_command(capsys, "probe", root / "two", "0,0", "--json"))
+    assert place["referenced"] is True
     shutil.copytree(root / "two", root / "three")
     assert "0.0 %" in run_command(capsys, "compare", root / "two", root / "three", "--png", tmp_path / "d.png")
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
-    assert json.loads(run_command(capsys, "compare", root / "two", root / "three", "--json"))["significant_share"] == 0
+    comparison = json.loads(run_command(capsys, "compare", root / "two", root / "three", "--json"))
+    assert comparison["significant_share"] == 0
 
 
 @pytest.mark.parametrize(
@@ -105,7 +107,7 @@ def test_folders_and_places_that_do_not_exist_are_refused(root, monkeypatch, com
         args.run(args)
 
 
-def test_at_a_place_of_the_metal_reference_that_is_its_name(root, capsys):
+def test_a_patch_that_is_the_metal_reference_is_probed_as_such(root, capsys):
     materials = root / "two" / "materials.json"
     content = json.loads(materials.read_text())
     content["segments"][0]["outline_mm"] = [[-50.0, -20.0], [-20.0, -20.0], [-20.0, 20.0], [-50.0, 20.0]]
@@ -136,7 +138,7 @@ def test_a_text_that_is_not_utf_8_is_refused_and_changes_no_notes(root, capsys, 
     run_command(capsys, "note", root / "one", *options)
     with pytest.raises(SystemExit) as ended:
         main(["note", str(root / "one"), option, os.fsdecode(b"gr\xfcn")])
-    assert ended.value.code == 2
+    assert ended.value.code == ConfigError.exit_status
     assert "UTF-8" in capsys.readouterr().err
     assert read_notes(root / "one") == Notes("oak", ("new",))
 

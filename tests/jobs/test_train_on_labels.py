@@ -19,16 +19,18 @@ from polysight_shared.errors import DataError
 from polysight_simulators.scene import decode_scene, simulate
 
 pytestmark = pytest.mark.slow
-# A name with letters outside of ASCII ("hard oak", in German and Chinese), and the places of the two plates in mm.
+# Name of the user's material, with letters outside of ASCII ("hard oak", in German and Chinese).
 MINE = "h\u00e4rtes \u6a61\u6728"
-PLACES = (-40.0, 10.0), (40.0, -10.0)
-# 5 mm inside the plates, on each side.
+# Centres of the two plates, mm. Each is 50 mm wide and high.
+COPPER_CENTRE = (-40.0, 10.0)
+BOARD_CENTRE = (40.0, -10.0)
+# Boxes 5 mm inside the plates, on each side.
 BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")
 
 
 def draw_scene(seed: int) -> dict[str, Any]:
-    copper = {"name": "copper", "centre_mm": PLACES[0], "size_mm": [50.0, 50.0], "metal": True}
-    board = {"name": "board", "centre_mm": PLACES[1], "size_mm": [50.0, 50.0], "permittivity": [3.2, 0.4]}
+    copper = {"name": "copper", "centre_mm": COPPER_CENTRE, "size_mm": [50.0, 50.0], "metal": True}
+    board = {"name": "board", "centre_mm": BOARD_CENTRE, "size_mm": [50.0, 50.0], "permittivity": [3.2, 0.4]}
     return make_scene(copper, board, columns=15, rows=17, seed=seed, disturbances={"leakage_measured": 0.003})
 
 
@@ -53,7 +55,7 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     elsewhere = tmp_path / "second"
     out = tmp_path / "out"
     library = tmp_path / "own.npz"
-    assert main(["train", str(first), str(second), "--out", str(library)]) == 3
+    assert main(["train", str(first), str(second), "--out", str(library)]) == DataError.exit_status
     assert f"do: polysight label {first}" in capsys.readouterr().err
     for scan, images in ((first, first / "products"), (second, elsewhere)):
         assert main(["image", str(scan), "--out", str(images)]) == 0
@@ -72,7 +74,7 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     assert {e.specimen for e in trained_library.entries if e.name == "copper"} == {None}
     # Also without their truth the scans count as simulated.
     assert trained_library.simulated
-    assert main(["train", str(first), str(first / "products"), "--out", str(library)]) == 3
+    assert main(["train", str(first), str(first / "products"), "--out", str(library)]) == DataError.exit_status
     assert "is given twice" in capsys.readouterr().err
 
     assert main(["process", str(third), "--out", str(out), "--library", str(library)]) == 0
@@ -80,7 +82,7 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     # One patch has the name; its middle is less than 10 mm from that of the plate.
     (patch,) = [s for s in segments if s["name"] == MINE]
     middle_mm = np.reshape(patch["box_mm"], (2, 2)).mean(axis=0)
-    assert np.hypot(*(middle_mm - PLACES[1])) < 10
+    assert np.linalg.norm(middle_mm - BOARD_CENTRE) < 10
     assert {s["name"] for s in segments} <= {MINE, "unknown", None}
     assert MINE in (out / "report.html").read_text(encoding="utf-8")
     capsys.readouterr()

@@ -45,7 +45,7 @@ def test_no_section_of_the_rig_can_be_changed(rig: Instrument):
 
 
 def test_the_rig_file_has_the_published_chirp_and_burst(rig: Instrument):
-    # The paper rounds to these digits.
+    # The relative limits are those of the digits that the paper gives.
     assert rig.chirp.swept_hz == pytest.approx(4.622e9, rel=1e-4)
     assert rig.chirp.first_sample_hz == pytest.approx(76.282e9, rel=1e-5)
     # A burst of 16 frames of 4 KiB.
@@ -54,12 +54,12 @@ def test_the_rig_file_has_the_published_chirp_and_burst(rig: Instrument):
 
 def test_mounts_reproduce_the_published_antenna_positions(rig: Instrument):
     h, v = rig.receivers
-    # Positions are published in tenths of a millimetre: half of that, and a little for rounding
+    # Positions are published in tenths of a millimetre: they are rounded by up to 0.05 mm.
     rounding_m = 6e-5
     assert geometry.tx_position_m(rig) == pytest.approx((-0.7055, 0.0974, 0.0130), abs=rounding_m)
     assert geometry.rx_positions_m(rig, h)[0] == pytest.approx((0.6843, 0.1035, 0.0094), abs=rounding_m)
     assert geometry.rx_positions_m(rig, v)[0] == pytest.approx((0.6836, 0.1337, 0.0104), abs=rounding_m)
-    # Published in millimetres and in degrees
+    # The paper gives the path to a millimetre. 0.1 degrees are a limit for the angle of 55 degrees.
     assert geometry.direct_path_m(rig, h)[0] == pytest.approx(1.390, abs=5e-4)
     assert geometry.incidence_deg(rig, h) == pytest.approx(55.0, abs=0.1)
 
@@ -83,7 +83,7 @@ def test_a_mount_step_is_a_whole_shift_or_a_whole_turn(step):
 
 @pytest.mark.parametrize(("axis", "first", "second"), [("x", 1, 2), ("y", 2, 0), ("z", 0, 1)])
 def test_a_mount_turns_right_handed_about_each_axis(axis: str, first: int, second: int):
-    """By 30 degrees, the first axis after the one of the turn moves towards the second, and the second away from it."""
+    """A turn about x moves y towards z and z away from y, and so on for the other axes. It is by 30 degrees here."""
     mount = (MountStep(turn_deg=30.0, about=axis),)
     # Points 1 m along each axis; positions on a board are in mm, those in the rig in m.
     points_mm = 1000.0 * np.eye(3)
@@ -206,7 +206,7 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
     ],
 )  # fmt: skip
 def test_a_value_at_its_limit_is_taken_and_one_beyond_is_refused(table: str, within: dict, beyond: dict):
-    """`beyond` changes one key of those that are set `within`."""
+    """A rig with the values of `within` is accepted; with the changed value of `beyond` it is refused."""
     raw = read_toml(RIG_FILE)
     raw.setdefault(table, {}).update(within)
     decode(raw, Instrument, "my.toml")
@@ -275,7 +275,7 @@ def test_boards_may_share_an_address_or_a_port_and_not_both():
     ],
 )
 def test_each_board_at_usb_has_one_place_of_its_own(tables: list[dict[str, str]], places: list[str] | None):
-    """A place is a serial number or a path of the bus; `places` is None where the tables are refused."""
+    """Its place is a serial number or a path of the bus. `places` is None for tables that are refused."""
     raw = {"native": dict(zip("ab", tables, strict=False))}
     if places is not None:
         assert [board.place for board in decode(raw, Radar, "my.toml").native.values()] == places
@@ -304,12 +304,13 @@ def test_pulses_need_a_line():
 
 
 def test_data_of_a_scan_are_counted(rig: Instrument):
-    # 2 bytes each of I and Q, 256 samples, four receivers.
-    assert rig.frame_bytes == 2 * 2 * 256 * 4
-    # 350 columns of 16 pulses; two boards; 200 rows.
-    assert rig.row_bytes == 350 * 16 * 4096
+    # A frame has 256 samples of four receivers. A sample has I and Q with 2 bytes each.
+    assert rig.frame_bytes == 256 * 4 * (2 + 2)
+    # A row has 350 positions of 16 frames.
+    assert rig.row_bytes == 350 * 16 * rig.frame_bytes
+    # Two boards record 200 rows.
     assert rig.recorded_row_bytes == 2 * rig.row_bytes
-    assert rig.scan_bytes == 200 * 2 * rig.row_bytes
+    assert rig.scan_bytes == 200 * rig.recorded_row_bytes
     # Data bytes of a full packet (docs/spec/dca1000.md).
     assert rig.card.payload_bytes == 1456
 

@@ -31,7 +31,7 @@ def test_the_firmware_header_is_the_table():
     assert (REPO / "arduino_stage" / "stage_errors.h").read_text() == format_c_header()
 
 
-# Times in ns, places in um and speeds in um/s: any integers of up to 60 bits
+# Times in ns, positions in um and speeds in um/s are any integers of up to 60 bits.
 integers = st.integers(-(2**60), 2**60)
 lines = st.integers(0, 60)
 levels = st.integers(0, 1)
@@ -53,7 +53,7 @@ def test_other_lines_are_refused(line: str):
 
 
 def test_a_client_receives_all_edges_in_order_and_detects_the_end_of_the_hub(tmp_path: Path):
-    # A hub of this test: it sends 1000 edges of one line, and closes the connection.
+    # The test itself is the hub: it sends 1000 edges of one line, and closes the connection.
     path = tmp_path / "hub"
     hub = socket.socket(socket.AF_UNIX)
     hub.bind(str(path))

@@ -21,7 +21,8 @@ def draw_values(declared: Any) -> st.SearchStrategy:
     """
     match declared:
         case inspect.IntType():
-            return st.integers(declared.ge, declared.le if declared.lt is None else declared.lt - 1)
+            largest = declared.le if declared.lt is None else declared.lt - 1
+            return st.integers(declared.ge, largest)
         case inspect.FloatType():
             return st.floats(declared.ge, declared.le, allow_nan=False)
         case inspect.StrType(pattern=None):
@@ -44,9 +45,9 @@ def draw_values(declared: Any) -> st.SearchStrategy:
     raise TypeError(declared)
 
 
-# One position; which one does not matter here.
-PLAN = RasterPlan(1, 1, 1.0, 1.0)
-# Fields that every event has, and the same as they are on the wire.
+# Any plan: its values do not matter here.
+PLAN = RasterPlan(columns=1, rows=1, step_x_mm=1.0, step_y_mm=1.0)
+# Fields that every event has, without and with the version that is added on the wire.
 STAMP = {"scan_id": "a", "seq": 1, "t_mono_ns": 5}
 HEAD_OF_EVENT = {"version": "1.0", **STAMP}
 

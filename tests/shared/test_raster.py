@@ -20,7 +20,7 @@ grids = st.builds(
 
 
 @given(grids)
-def test_every_position_is_met_exactly_once(grid: Grid):
+def test_a_plan_has_every_position_exactly_once(grid: Grid):
     positions = [(row.column(i), row.index) for row in plan_raster(grid) for i in range(row.points)]
     expected = [(column, row) for column in range(grid.columns) for row in range(grid.rows)]
     assert sorted(positions) == sorted(expected)

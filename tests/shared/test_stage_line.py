@@ -53,9 +53,9 @@ def test_every_single_bit_flip_is_refused(messages: st.SearchStrategy[Command | 
 
 
 def test_no_flipped_bit_makes_an_immediate_byte_of_another_and_no_two_make_resume():
-    """RESUME moves a stage that was held: it differs from the bytes of lines and of other commands in three bits.
+    """RESUME differs in three bits from the bytes of lines and of other commands, as it moves a stage that was held.
 
-    The others differ in two bits, also from printable characters that no line has.
+    The other immediate bytes differ in two bits from these, and from printable characters that no line has.
     """
     used_in_lines = set(b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ-* \n")
     printable = set(range(0x20, 0x7F))

@@ -23,8 +23,8 @@ from polysight_shared.tables import to_builtins
 from polysight_simulators.uno import ENABLING_COMMAND, compile_emulator, compile_firmware, list_missing_packages
 
 HERE = Path(__file__).parent
-# Longest time of a guest. Only one that hangs reaches it: a published row takes 4 minutes of a core, and a busy machine
-# gives a fifth of one.
+# Longest time of a guest, seconds. A published row takes 4 minutes of a core, and on a busy machine a guest has a fifth
+# of a core: only a guest that hangs reaches the limit.
 LIMIT_S = 3000
 
 
@@ -36,7 +36,8 @@ def kernel(request: pytest.FixtureRequest) -> Path:
     if lacking := list_missing_packages():
         pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
     # Compiled here, because in the guest everything is read-only.
-    compile_emulator(), compile_firmware()
+    compile_emulator()
+    compile_firmware()
     built = subprocess.run([str(HERE / "build_kernel.sh")], stdout=subprocess.PIPE, text=True, check=False)
     assert built.returncode == 0, "the kernel was not built: see above"
     return Path(built.stdout.splitlines()[-1])
@@ -44,7 +45,7 @@ def kernel(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture
 def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
-    """Runs chain.py in the guest for a row of so many points; kernel options such as time-travel can be given."""
+    """Function that runs chain.py in the guest for a row of `points` positions, with options of the kernel."""
 
     def run(points: int, *options: str, real_time: bool = False, speed_mm_s: float = 20.0) -> dict[str, Any]:
         config = tmp_path / "instrument.toml"
@@ -76,9 +77,10 @@ def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
 
 
 def _prepare_guest(real_time: bool) -> None:
-    """In the guest's process: end with the tests, however they end; in real time also go before other programs.
+    """Let the guest's process end with the tests, however they end.
 
-    Real-time scheduling, where it is permitted: a Pi does not share its processor with a test suite.
+    In real time it is also scheduled before other programs, where that is permitted: a Pi does not share its processor
+    with a test suite.
     """
     die_with_parent(signal.SIGKILL)
     if real_time:
@@ -89,7 +91,7 @@ def _prepare_guest(real_time: bool) -> None:
 def _make_rig(points: int, one_shot: bool, speed_mm_s: float) -> Instrument:
     """The published rig with one row, near the home corner.
 
-    In real time a system call takes some 10 us in user-mode Linux: there pulses are not short enough without one shot.
+    In user-mode Linux a system call takes some 10 us of real time: without a one-shot pulses are too long there.
     """
     rig = time_by_the_program(load_published_rig())
     replace = msgspec.structs.replace

@@ -26,7 +26,7 @@ from polysight.acquisition.control import ALIVE_FILE, CONTROL_FOLDER, SignOfLife
 from polysight.products import SCAN, write_json
 from polysight.products.folder import replace_products
 from polysight.results import ScanFacts, to_plain
-from polysight.serve import commands as control, site
+from polysight.serve import commands, site
 from polysight.serve.guard import TOKEN_HEADER
 from polysight_shared.config import CheckPlate, load_instrument
 from polysight_shared.errors import ErrorCode
@@ -150,28 +150,30 @@ def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans, damage
     (scans / damaged / "products" / "materials.json").write_text("{")
     chart = get(view, "/api/check")
     assert [scan["name"] for scan in chart["scans"]] == [other]
-    # Its level from before is not shown: it belongs to other products.
+    # The level of the damaged scan is not shown any more: it belongs to the products before the damage.
     assert chart["unreadable"] == [damaged]
 
 
 def test_one_of_two_simultaneous_starts_is_refused(view, scans, monkeypatch):
     """Checking that the rig is free and starting are one step: the second request sees the first one's program."""
-    # Would let both requests pass the check before either starts. With one step for both, only one comes here, and
-    # the barrier breaks after 3 s.
+    # The barrier would let both requests pass the check before either starts its program. As check and start are one
+    # step, only one request reaches the barrier, which breaks after 3 s.
     both_have_checked = threading.Barrier(2, timeout=3.0)
-    check_free = control._check_free
+    check_free = commands._check_free
 
     def check_free_and_wait(site: object) -> None:
         check_free(site)
         with suppress(threading.BrokenBarrierError):
             both_have_checked.wait()
 
-    monkeypatch.setattr(control, "_check_free", check_free_and_wait)
+    monkeypatch.setattr(commands, "_check_free", check_free_and_wait)
     statuses: list[int] = []
-    threads = [
-        threading.Thread(target=lambda n=name: statuses.append(post(view, "/api/start", {"name": n})[0]))
-        for name in ("first", "second")
-    ]
+
+    def start_scan(name: str) -> None:
+        status, _ = post(view, "/api/start", {"name": name})
+        statuses.append(status)
+
+    threads = [threading.Thread(target=start_scan, args=(name,)) for name in ("first", "second")]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -236,7 +238,7 @@ def test_of_two_live_views_of_a_scan_that_are_opened_together_one_is_closed(tmp_
         (True, 0, "running"),
         # The process exists, but has not renewed its sign of life for a minute.
         (True, 60, "frozen"),
-        # The process was killed just now, or more than a day ago: that is not news any more.
+        # The process was killed just now, or more than a day ago, which pages do not report any more.
         (False, 0, "lost"),
         (False, 1e5, None),
     ],
@@ -332,7 +334,11 @@ def test_exports_stay_in_the_scan(view, scans, tmp_path):
 
 @pytest.mark.parametrize(("base", "saved"), [(None, 40), ({"notes": "", "tags": []}, 1)])
 def test_notes_that_somebody_else_has_changed_are_not_overwritten(view, scans, base, saved):
-    """A request has the notes on which it is based: of 40 with the empty ones, the first is saved. Without, all are."""
+    """A request may state on which notes it is based.
+
+    Of 40 requests that are based on empty notes one is saved, as the notes are not empty any more for the others. Of 40
+    requests that state nothing all are saved.
+    """
     with ThreadPoolExecutor(2) as pool:
         requests = ({"notes": f"{k}", "base": base} for k in range(40))
         answers = list(pool.map(lambda body: post(view, "/api/notes?scan=one", body), requests))
@@ -357,7 +363,7 @@ def test_a_client_that_disconnects_in_its_request_causes_no_traceback(view, capf
     head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
     for _ in range(3):
         with socket.create_connection(("127.0.0.1", view.port)) as s:
-            # One of 90 bytes.
+            # The head announces a body of 90 bytes, of which one is sent.
             s.sendall(f"{head}Content-Length: 90\r\n\r\n{{".encode())
     assert get(view, "/api/scans")
     # The traceback would come after the answer of the next request.
@@ -367,9 +373,10 @@ def test_a_client_that_disconnects_in_its_request_causes_no_traceback(view, capf
 
 def test_the_last_box_can_be_removed(view):
     extent = get(view, "/api/result?scan=one")["extent_mm"]
-    # From the corner with the smallest x and y to the middle of the image.
-    box = [extent[0], extent[2], 0.0, 0.0]
-    # No labels are there to remove.
+    # A box from the corner with the smallest x and y to the middle of the image.
+    x_min, _, y_min, _ = extent
+    box = [x_min, y_min, 0.0, 0.0]
+    # There are no labels yet that could be removed.
     assert post(view, "/api/labels?scan=one", {"boxes": {}})[0] == 404
     status, saved = post(view, "/api/labels?scan=one", {"boxes": {"oak": box}})
     assert status == 200, saved

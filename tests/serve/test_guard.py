@@ -26,7 +26,8 @@ from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight_shared.errors import ErrorCode
 
 SECRET = "nobody may read this"
-# Names that contain one of this server's, an address of the network on a server bound to loopback, and broken ones.
+# Names that contain a name of this server, an address of the network (the server is bound to loopback), and names that
+# are no names of hosts.
 FOREIGN_HOSTS = ("evil.example", "127.0.0.1.evil.example", "localhost.evil.example:80", "192.168.1.7", "", "[", "a:b:c")
 # Everything that can be read of a scan, as paths below /api/.
 READ_PATHS = ("scan", "result", "thumbnail", "state", "map/h_amplitude", "file/image.npz", "probe", "file/secret.txt")
@@ -145,7 +146,7 @@ def test_large_bodies_and_heads_are_refused_and_change_no_file(scans):
 
 
 def test_other_clients_with_unfinished_requests_or_unread_answers_do_not_block_the_operator(scans):
-    """300 clients send a part of a head, and 100 ask for 300 pages and read none."""
+    """300 clients send a part of the head of a request. 100 clients ask for 300 pages each, and read none."""
     pages = b"GET /common.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 300
     with serve_folder(scans, TOKEN) as view, ExitStack() as clients:
         operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
@@ -155,7 +156,8 @@ def test_other_clients_with_unfinished_requests_or_unread_answers_do_not_block_t
             if k % 4 == 0:
                 client.send(pages)
             else:
-                client.send(b"GET / HTTP/1.1\r\nHo"[: k % 18])
+                begin_of_head = b"GET / HTTP/1.1\r\nHo"
+                client.send(begin_of_head[: k % len(begin_of_head)])
             if k % 50 == 0:
                 operator.request("GET", "/api/scans")
                 assert operator.getresponse().read()
@@ -165,7 +167,7 @@ def test_other_clients_with_unfinished_requests_or_unread_answers_do_not_block_t
 
 
 def test_of_too_many_connections_those_without_a_request_are_closed(scans, monkeypatch):
-    """Neither an answered connection nor one whose request lies unread blocks new clients."""
+    """Connections that were answered, or whose request was not read yet, do not block new clients."""
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 20)
     with serve_folder(scans, TOKEN) as view, ExitStack() as clients:
         operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
@@ -188,7 +190,7 @@ def test_of_too_many_connections_those_without_a_request_are_closed(scans, monke
 
 
 def test_when_every_connection_has_a_request_the_next_one_is_answered_as_busy(scans, monkeypatch):
-    """No connection is closed whose request has arrived when it is accepted."""
+    """A connection is not closed if its request has arrived when the connection is accepted."""
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 4)
     monkeypatch.setattr(server, "ACCEPTED_AT_ONCE", 3)
     monkeypatch.setattr(CountedConnection, "has_unread_bytes", lambda _: True)
@@ -201,7 +203,7 @@ def test_when_every_connection_has_a_request_the_next_one_is_answered_as_busy(sc
             clients.callback(stream.close)
             stream.request("GET", "/api/events?scan=one")
             answers.append(stream.getresponse().status)
-    assert answers == [*[200] * 9, 503]
+    assert answers == [200] * 9 + [503]
 
 
 def test_too_many_connections_close_silent_ones_and_none_with_unread_bytes():
@@ -332,13 +334,14 @@ def list_hostile_requests(port: int) -> list[bytes]:
 
     requests = list(WRONG_HEADS)
     for path in POST_PATHS:
-        refused_headers = [[host_line, f"{TOKEN_HEADER}: {t}"] for t in ("", "x", TOKEN[:-1], "\xff")]
+        wrong_tokens = ("", "x", TOKEN[:-1], "\xff")
+        refused_headers = [[host_line, f"{TOKEN_HEADER}: {wrong_token}"] for wrong_token in wrong_tokens]
         refused_headers += [
             [host_line],
             ["Host: evil.example", token],
             [host_line, token, "Sec-Fetch-Site: cross-site"],
         ]
-        refused_headers += [[host_line, token, f"Origin: {o}"] for o in ("https://evil.example", "null")]
+        refused_headers += [[host_line, token, f"Origin: {origin}"] for origin in ("https://evil.example", "null")]
         requests += [
             request(f"POST /api/{path}", *headers, "Content-Length: 2", body=b"{}") for headers in refused_headers
         ]
@@ -347,7 +350,7 @@ def list_hostile_requests(port: int) -> list[bytes]:
     for path in ("scan", "result", "file/image.npz", "thumbnail"):
         requests += [request(f"GET /api/{path}?scan={name}", host_line) for name in WRONG_NAMES]
     requests += [request(f"GET /{path}", host_line) for path in WRONG_PATHS]
-    notes = f"POST /api/{POST_PATHS[1]}", host_line, token
+    notes = (f"POST /api/{POST_PATHS[1]}", host_line, token)
     requests += [request(*notes, f"Content-Length: {length}", body=b"{") for length in WRONG_LENGTHS]
     requests += [request(*notes, f"Content-Length: {len(body)}", body=body) for body in WRONG_NOTES]
     # A head that is too large, a change of the protocol, and two Host headers.

@@ -54,7 +54,7 @@ def test_a_list_that_is_unchanged_is_not_sent_again(tmp_path):
         write_judged_products(tmp_path / name / "products", "care")
     with serve_folder(tmp_path) as view:
         listing = get(view, "/api/scans")
-        # Sizes of folders come later than their names; they are changes, too.
+        # The size of a folder comes later than its name, as a change of the list.
         while any(scan["bytes"] is None for scan in listing["scans"]):
             listing = get(view, "/api/scans")
         assert listing["whole"]

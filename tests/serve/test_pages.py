@@ -45,6 +45,8 @@ PAGES = {
 }
 
 
+# A box that is drawn has corners at whole pixels of the screen: it may differ from the wanted one by some of them.
+DRAWING_TOLERANCE_MM = 1.5
 # Permittivity of the check plate in each scan's rig file: the true one, and one that disagrees with every measurement.
 KNOWN_PERMITTIVITY = {"one": (3.78, 0.7), "two": (9.0, 0.01)}
 
@@ -116,7 +118,12 @@ def write_points(path: Path, permittivities: tuple[float, ...] = (2.5, 3.0, 3.5,
     properties = "".join(f"property float {name}\n" for name in PLY_COLUMNS)
     rows = []
     for x, permittivity in enumerate(permittivities):
-        loss, error = (0.1, 0.2) if math.isfinite(permittivity) else (math.nan, math.nan)
+        if math.isfinite(permittivity):
+            loss = 0.1
+            error = 0.2
+        else:
+            loss = math.nan
+            error = math.nan
         rows.append(struct.pack("<10fi", x, 2 * x, -x, 0, 0, -1, permittivity, loss, error, 55, 1))
     head = f"{PLY_HEAD}{properties}property int segment\nend_header\n"
     path.write_bytes(head.encode() + b"".join(rows))
@@ -336,9 +343,11 @@ def test_long_names_and_tags_fit(page, scans):
         page.browser.visit(f"{page.view.address}{path}#token={TOKEN}", PHONE)
         if path == "/":
             ready = "document.querySelectorAll('#list li').length == 3"
+        elif path.startswith("/compare"):
+            ready = PAGES["/compare?a=one&b=two"]
         else:
-            ready = PAGES.get(path)
-        page.browser.wait(ready or PAGES["/scan?scan=one"], path)
+            ready = PAGES["/scan?scan=one"]
+        page.browser.wait(ready, path)
         assert page.browser.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, path
 
 
@@ -368,8 +377,8 @@ def test_scans_are_searched_in_the_list_and_two_are_compared(page):
     page.browser.wait("document.querySelectorAll('#list li').length == 1", "the search")
     page.browser.fill("#find", "")
     page.browser.wait("document.querySelectorAll('#list li').length == 2", "all of them")
-    for k in (0, 1):
-        page.browser.evaluate(f"document.querySelectorAll('#list input')[{k}].click()")
+    for number in (0, 1):
+        page.browser.evaluate(f"document.querySelectorAll('#list input')[{number}].click()")
     page.browser.click("#compare")
     page.browser.wait(
         "location.pathname == '/compare' && document.querySelector('#rows tr')",
@@ -384,15 +393,18 @@ def test_scans_are_searched_in_the_list_and_two_are_compared(page):
 
 def test_a_place_is_probed_by_keyboard_alone(page):
     page.open("/scan?scan=one")
+    # The page has fewer than 60 controls before the image.
     for _ in range(60):
         if page.browser.evaluate("document.activeElement?.className == 'imageview'"):
             break
         page.press("Tab")
     assert page.browser.evaluate("document.activeElement.className") == "imageview"
-    for _ in range(int(PET["centre_mm"][0] / 2)):
+    # The place begins in the middle of the image, and an arrow key moves it by 2 mm.
+    x_mm, y_mm = PET["centre_mm"]
+    for _ in range(int(x_mm / 2)):
         page.press("ArrowRight")
-    for _ in range(int(-PET["centre_mm"][1] / 2)):
-        page.press("ArrowDown")
+    for _ in range(int(y_mm / 2)):
+        page.press("ArrowUp")
     page.press("Enter")
     page.browser.wait("document.querySelectorAll('#probe-facts dt').length > 5", "the probe")
     shown_text = page.browser.read_text("probe-facts")
@@ -505,8 +517,7 @@ def test_metal_is_drawn_for_processing_again(page):
     # "...: x0, y0, x1, y1 mm", with typographic minus signs
     _, _, numbers = page.browser.read_text("draw-metal").partition(": ")
     sides = numbers.replace("\u2212", "-").removesuffix(" mm").split(", ")
-    # Within some pixels of the screen
-    assert [float(side) for side in sides] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=1.5)
+    assert [float(side) for side in sides] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=DRAWING_TOLERANCE_MM)
     page.check_whole()
 
 
@@ -576,13 +587,13 @@ def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, sc
 
 
 def test_advice_with_an_option_of_a_command_is_shown_in_the_words_of_the_page(page):
-    """No text on materials that pages show names an option, which no page has."""
+    """Texts on materials name options of commands. Pages show them in other words, as no page has options."""
     texts = []
     for name in ("results/verdict.py", "results/rules.py", "materials/analyse.py", "materials/labels.py",
                  "materials/sub_bands.py", "materials/training_advice.py"):  # fmt: skip
         source = (Path(polysight.__file__).parent / name).read_text(encoding="utf-8")
         texts += re.findall(r'"([^"\n]*--[a-z][^"\n]*)"', re.sub(r"\{[^}]*\}", "5", source))
-    # Such texts were found.
+    # Texts that name an option were found.
     assert len(texts) > 9
     page.open("/")
     shown_texts = page.browser.evaluate(
@@ -615,7 +626,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
         labels = read_labels(scans / name / "labels.json")
         assert labels.metal == "copper"
         x, y = PET["centre_mm"]
-        assert labels.boxes["my plastic"] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=1.5)
+        assert labels.boxes["my plastic"] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=DRAWING_TOLERANCE_MM)
         page.check_whole()
     offered_names = "[...document.getElementById('known').options].map((option) => option.value)"
     page.browser.wait(

@@ -205,8 +205,8 @@ def test_an_interrupt_at_a_fork_is_not_lost(tmp_path, fork):
     assert messages.splitlines() == ["polysight serve: starting", "polysight serve: stopped"]
 
 
-def test_an_interrupt_of_new_processes_is_left_to_the_server(tmp_path):
-    """Ctrl-C reaches all processes of a terminal, and those that begin are not a server yet."""
+def test_an_interrupt_in_a_new_process_causes_no_traceback(tmp_path):
+    """Ctrl-C reaches all processes of a terminal, also one that has just been forked; the server ends that process."""
     status, messages = serve_interrupted("12", "after_in_child", tmp_path)
     assert status == 128 + signal.SIGINT
     assert "Traceback" not in messages

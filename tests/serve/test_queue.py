@@ -64,10 +64,11 @@ def test_scans_start_in_order_when_the_rig_is_free(queue, rig):
     with expect_refusal(ErrorCode.NAME_TAKEN):
         queue.add("second", b'{"name": "second"}')
     queue.remove("second")
-    for count, name in enumerate(("first", "third"), 1):
-        rig.is_busy = False
-        wait_for(lambda n=count: len(rig.started) == n, name)
-        assert rig.started[-1] == name
+    rig.is_busy = False
+    wait_for(lambda: rig.started == ["first"], "the first")
+    # The first scan has ended.
+    rig.is_busy = False
+    wait_for(lambda: rig.started == ["first", "third"], "the third")
     wait_for(lambda: queue.waiting().names == [], "an empty queue")
 
 

@@ -35,7 +35,7 @@ from polysight_shared.errors import ErrorCode
 
 @pytest.fixture
 def desk(growing):
-    """A running scan without events so far: its folder, and the stop request that gets the commands."""
+    """A running scan without events so far: its folder, and the object that receives the commands."""
     growing.grow_until("scan_started")
     with open_control(growing.path) as stop:
         yield growing.path, stop
@@ -72,7 +72,7 @@ def test_a_view_is_read_only_unless_control_is_allowed(desk, watching):
 
 
 def test_tokens_are_compared_in_constant_time(desk, watching, monkeypatch):
-    """The right token is refused when the standard library's comparison says that it differs, so no other is used."""
+    """The standard library has such a comparison. If it says that the right token differs, the command is refused."""
     compared = []
 
     def record_and_deny(given: bytes, expected: bytes) -> bool:
@@ -80,7 +80,8 @@ def test_tokens_are_compared_in_constant_time(desk, watching, monkeypatch):
         return False
 
     monkeypatch.setattr(hmac, "compare_digest", record_and_deny)
-    with serve_view(watching(desk[0], control=True), TOKEN) as view:
+    folder, _ = desk
+    with serve_view(watching(folder, control=True), TOKEN) as view:
         assert ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})[0] == 403
     assert (TOKEN.encode(), TOKEN.encode()) in compared
 
@@ -94,7 +95,8 @@ def test_a_command_to_a_finished_scan_is_refused_with_a_remedy(finished_scan, wa
 
 def test_by_default_only_this_machine_reaches_the_server():
     args = build_parser().parse_args(["preview", "scans/one"])
-    assert (args.host, args.port, args.control) == ("127.0.0.1", 8080, False)
+    assert (args.host, args.port) == ("127.0.0.1", 8080)
+    assert args.control is False
     assert all(ServerAddress(host).loopback for host in (args.host, "localhost", "::1", "127.3.2.1"))
     assert not any(ServerAddress(host).loopback for host in ("0.0.0.0", "::", "192.168.33.30", "pi.lab"))
 
@@ -105,6 +107,16 @@ def test_the_page_loads_nothing_from_other_servers():
         addresses = set(re.findall(r"https?://[^\s\"'<)]+", path.read_text(encoding="utf-8")))
         assert addresses <= {"http://www.w3.org/2000/svg"}, path
     assert 'src="' in (STATIC / "frame.html").read_text()
+
+
+def has_rows(rows):
+    """Function that is true of a state whose pictures have so many rows."""
+
+    def has_these_rows(state):
+        pictures = state.get("pictures")
+        return pictures is not None and pictures["rows"] == rows
+
+    return has_these_rows
 
 
 def test_clients_that_never_read_their_events_delay_no_other_client(growing, watching):
@@ -119,10 +131,11 @@ def test_clients_that_never_read_their_events_delay_no_other_client(growing, wat
             connection.connect(("127.0.0.1", view.port))
             connection.sendall(b"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
             deaf_clients.append(connection)
-        for rows in range(3):
+        for rows in (1, 2, 3):
             growing.grow_until("row_committed")
-            watch.wait_for(lambda s, n=rows + 1: (s.get("pictures") or {}).get("rows") == n)
-            assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
+            watch.wait_for(has_rows(rows))
+            _, body, _ = ask(view, "/api/state")
+            assert json.loads(body)["pictures"]["rows"] == rows
         for connection in deaf_clients:
             connection.close()
 
@@ -177,7 +190,8 @@ def test_connections_wait_in_the_longest_queue_that_the_system_allows():
         length = read_queue_length(listener)
         server.should_exit = True
         thread.join(HANG_S)
-    assert length == longest > 100
+    assert length == longest
+    assert longest > 100
 
 
 def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
@@ -188,8 +202,8 @@ def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
     # Escape codes: the terminal's own colours, and black (16 of 256) on white (231). Values: whether the foreground is
     # dark, and the background.
     colours = {"0": (black_text, not black_text), "38;5;16;48;5;231": (True, False)}
-    # For each character whether its upper and its lower half have the colour of the foreground (0) or background (1):
-    # space, upper half, lower half, full block.
+    # Colours of the upper and the lower half of each character, 0 for the foreground and 1 for the background. The
+    # characters are a space, the upper half, the lower half and the full block.
     blocks = {" ": (1, 1), "\u2580": (0, 1), "\u2584": (1, 0), "\u2588": (0, 0)}
     rows: list[list[bool]] = []
     dark = colours["0"]

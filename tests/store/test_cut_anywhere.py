@@ -71,8 +71,8 @@ def test_manifest(undisturbed_scan, tmp_path, sample, record, tail):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(lines_before + last[:cut] + tail)
         assert list_faults(scan) == []
-        torn = [n for n in list_faults(scan, "note") if "torn" in n]
-        assert len(torn) == bool(last[:cut] + tail)
+        incomplete_lines = [n for n in list_faults(scan, "note") if "incomplete" in n]
+        assert len(incomplete_lines) == bool(last[:cut] + tail)
         assert resume(scan, undisturbed_scan, image=not cut) == ({2} if record == -2 else set())
 
 
@@ -85,7 +85,7 @@ def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
         turn(scan.path / "manifest.jsonl", 8 * offset + bit)
         # The line end: this line and the next are one
         end = bit // 8 == len(whole_lines[record]) - 1
-        named = list_faults(scan) + [n for n in list_faults(scan, "note") if "torn" in n or "damaged" in n]
+        named = list_faults(scan) + [n for n in list_faults(scan, "note") if "incomplete" in n or "damaged" in n]
         assert len(named) == 1
         # The last line is cut off, others stay where they are
         is_kept = record == -1 or (record == -2 and end)
@@ -121,7 +121,7 @@ def test_an_event_log_that_was_cut_is_completed_from_the_journal(undisturbed_sca
             assert list_faults(scan) == []
         else:
             assert "resume fetches" in list_faults(scan)[0]
-        assert len([n for n in list_faults(scan, "note") if "torn" in n]) == (cut > start or bool(tail))
+        assert len([n for n in list_faults(scan, "note") if "incomplete" in n]) == (cut > start or bool(tail))
         assert resume(scan, undisturbed_scan) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
 

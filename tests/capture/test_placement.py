@@ -27,7 +27,7 @@ from tests.support.capture.records import (
 )
 
 from polysight.capture.dca1000 import Counters, PacketLog
-from polysight.capture.placement import EarlierRecords, Evidence, Losses, PlacedRecord, place_record
+from polysight.capture.placement import EarlierRecords, Evidence, Losses, PacketCounts, PlacedRecord, place_record
 from polysight.capture.row_files import read_packets, write_packets
 
 # Bytes of a frame
@@ -122,6 +122,18 @@ class Oracle:
         self.extent = max(self.extent, stop)
 
 
+# What stands for the number of a packet that is not of the record: one of the record before, and a malformed one.
+LEFTOVER = -1
+MALFORMED = -2
+# No byte at all, a header without payload, and more than a full packet: by one byte, and by many.
+MALFORMED_PACKETS = [b"", b"0123456789", bytes(HEADER_BYTES + FULL + 1), bytes(1536)]
+
+
+def sum_counts(c: PacketCounts) -> int:
+    """Return the number of packets of a row whose card has not restarted, by the counts of their kinds."""
+    return c.placed + c.duplicates + c.conflicting + c.leftover + c.outside + c.disagreeing + c.malformed
+
+
 @settings(max_examples=200, deadline=None, suppress_health_check=SLOW)
 @given(
     frame=st.integers(32, 16384).map(lambda words: 4 * words),
@@ -158,21 +170,15 @@ def test_unmasked_bytes_are_right_with_every_disorder_together(
     sent.sort(key=lambda s: s[0])
     arriving = [(k, packet) for _, k, packet in sent]
 
-    # Packets of the record before (number -1), and malformed ones (number -2), anywhere but at the begin.
-    leftovers = 0
-    malformed = 0
+    # Other packets come anywhere but at the begin.
     for position in range(len(arriving), 1, -1):
         if rng.random() < strange:
             distance = rng.randint(1, 5)
-            arriving.insert(
-                position, (-1, encode_packet(sequence - distance, count - distance * FULL, bytes([0xEE]) * FULL))
-            )
-            leftovers += 1
+            leftover = encode_packet(sequence - distance, count - distance * FULL, bytes([0xEE]) * FULL)
+            arriving.insert(position, (LEFTOVER, leftover))
         if rng.random() < strange:
-            # No byte at all, a header without payload, and more than a full packet: by one byte, and by many.
-            malformed_packets = [b"", b"0123456789", bytes(HEADER_BYTES + FULL + 1), bytes(1536)]
-            arriving.insert(position, (-2, rng.choice(malformed_packets)))
-            malformed += 1
+            arriving.insert(position, (MALFORMED, rng.choice(MALFORMED_PACKETS)))
+    numbers = [number for number, _ in arriving]
 
     oracle = Oracle(size)
     for k, packet in arriving:
@@ -181,17 +187,8 @@ def test_unmasked_bytes_are_right_with_every_disorder_together(
     placed, out = place(size, [p for _, p in arriving], Counters(count, sequence), frame, batch)
     counts = placed.counts
     assert is_original_or_masked(record, placed, out)
-    assert (
-        counts.placed
-        + counts.duplicates
-        + counts.conflicting
-        + counts.leftover
-        + counts.outside
-        + counts.disagreeing
-        + counts.malformed
-        == len(arriving)
-    )
-    assert counts.malformed == malformed
+    assert sum_counts(counts) == len(arriving)
+    assert counts.malformed == numbers.count(MALFORMED)
     # The expectation holds if the first packet is the record's first or a full one: a shorter one may be the last of
     # the record before.
     first_is_of_the_record = False
@@ -200,7 +197,7 @@ def test_unmasked_bytes_are_right_with_every_disorder_together(
         first_is_of_the_record = first_number == 0 or len(first_packet) == HEADER_BYTES + FULL
     if first_is_of_the_record and not counts.disagreeing:
         assert (counts.placed, counts.duplicates, counts.late) == (oracle.placed, oracle.duplicates, oracle.late)
-        assert counts.leftover == leftovers
+        assert counts.leftover == numbers.count(LEFTOVER)
         assert counts.outside == 0
         assert placed.received == oracle.received.sum()
         losses = placed.losses

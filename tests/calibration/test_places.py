@@ -135,7 +135,7 @@ def test_a_target_that_was_laid_up_to_12_mm_beside_its_place_is_found(case):
     # Depth of the plane, x and y of the target, and its turn
     unknowns = np.array([0.0, *laid_mm, 0.0])
     boards = []
-    for loaded in load_echoes(open_raw(folder, None), believed).values():
+    for loaded in load_echoes(open_raw(folder), believed).values():
         # A few positions suffice without noise.
         board = replace(loaded, samples=loaded.samples[:, ::20], offsets_m=loaded.offsets_m[::20])
         echoes = places._model_echoes(board, np.zeros(3), places._place_points(centre, points_mm, unknowns))
@@ -147,7 +147,7 @@ def test_a_target_that_was_laid_up_to_12_mm_beside_its_place_is_found(case):
 def test_an_active_calibration_corrects_every_antenna(case, file):
     _, _, rig_of_file, true_rig = case
     corrected = Calibration(places=file).rig(rig_of_file)
-    # About two of the largest standard errors that the test above allows
+    # The limit is about two of the largest standard errors that the test above allows.
     assert corrected.geometry.object_distance_mm == pytest.approx(true_rig.geometry.object_distance_mm, abs=0.5)
     for name in SHIFTS:
         true_m = Antennas.from_rig(true_rig, true_rig.by_name(name)).rx_m

@@ -148,7 +148,7 @@ def test_a_missing_folder_for_the_bundle_is_refused_before_the_checks_run(tmp_pa
 )
 def test_the_value_after_a_word_such_as_key_or_token_is_removed(text: str) -> None:
     _, secret_key = zmq.curve_keypair()
-    # Without characters that end a value in one of these texts
+    # A character that ends the value in one of these texts is replaced by a letter.
     key = re.sub(r"""["',}]""", "a", secret_key.decode())
     redact = Redactor([])
     for value in (key, "short-but-secret"):
@@ -179,6 +179,6 @@ def test_a_full_disk_leaves_the_earlier_bundle_and_no_incomplete_one(tmp_path: P
     full_disk = FaultyDisk(tmp_path, fault="short", at=1)
     options = DoctorOptions(config=tmp_path / "instrument.toml")
     with full_disk(), pytest.raises(DeviceError):
-        write_bundle(file, options, None, [ok("fine")], "fine")
+        write_bundle(file, options, rig=None, findings=[ok("fine")], text="fine")
     assert file.read_bytes() == b"earlier"
     assert list(tmp_path.iterdir()) == [file]

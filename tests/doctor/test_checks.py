@@ -62,7 +62,7 @@ def test_a_burst_that_does_not_fit_between_two_points_is_an_error(tmp_path):
 def run_check_by_name(context, name):
     """Run the check with this name; return the level of its finding."""
     check = next(c for c in CHECKS if c.name == name)
-    return checks._run_check(check, context, None).level
+    return checks._run_check(check, context, board=None).level
 
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):

@@ -51,7 +51,9 @@ def test_all_checks_of_a_healthy_rig_pass(live, capsys):
     document = json.loads(capsys.readouterr().out)
     findings = {f["check"]: f for f in document["findings"]}
     assert [f for f in document["findings"] if f["verdict"] == "error"] == []
-    assert (status, document["ok"], document["simulated"]) == (0, True, True)
+    assert status == 0
+    assert document["ok"] is True
+    assert document["simulated"] is True
     assert {n for n, f in findings.items() if f["verdict"] not in ("ok", "warning")} == set()
     # The doctor moves the stage past 8 positions, and then sends 64 pulses.
     assert findings["trigger line"]["facts"]["edges"] == 8

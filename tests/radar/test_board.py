@@ -151,7 +151,8 @@ def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, cloc
         radar.arm(frames)
         send_pulses(board, clock, frames)
         assert radar.poll() is State.DONE
-    assert board.executed.count(Frame.ID) == board.executed.count(FrameApply.ID) == 2
+    assert board.executed.count(Frame.ID) == 2
+    assert board.executed.count(FrameApply.ID) == 2
     assert board.executed.count(FrameControl.ID) == 3
 
 
@@ -297,7 +298,7 @@ def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, command
         begun_s = clock.time
         with expect_refusal(ErrorCode.RADAR_RESTARTED, "RH"):
             radar.arm(FRAMES)
-        # In virtual time; up to 0.7 s are measured.
+        # This is virtual time; up to 0.7 s are measured.
         assert clock.time - begun_s < 8.0, command_of_restart
         assert radar.state is State.FAULT
         radar.arm(FRAMES)
@@ -370,7 +371,7 @@ def test_events_without_end_delay_a_poll_only_briefly(radar, board, clock):
         board.send_event(REPORT_OF_CALIBRATION, bytes(20))
     begun_s = clock.time
     assert radar.poll() is State.ARMED
-    # In virtual time; 0.07 s is measured.
+    # This is virtual time; 0.07 s is measured.
     assert clock.time - begun_s < 0.5
     assert any("without a pause" in line for line in radar.warnings)
     for _ in range(200):

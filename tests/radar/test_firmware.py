@@ -302,7 +302,7 @@ def test_a_power_failure_at_any_part_is_recoverable(clock, part):
         radar.write_flash(IMAGE, ignore)
     board.switch_power(True)
     rescued = make_board(board, clock, IMAGE)
-    # From RAM it starts with any content of its flash.
+    # With firmware in its RAM a board starts whatever its flash contains.
     rescued.configure()
     assert rescued.state is State.CONFIGURED
     make_board(board, clock).write_flash(IMAGE, ignore)
@@ -318,7 +318,7 @@ def test_a_restart_during_a_download_ends_it_immediately(clock, part):
         make_board(board, clock, words=words).write_flash(IMAGE, ignore)
     # No message was sent after the restart.
     assert words.later == 0
-    # In virtual time; 0.4 s is measured.
+    # This is virtual time; 0.4 s is measured.
     assert clock.time < 5.0
 
 

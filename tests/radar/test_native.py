@@ -276,7 +276,8 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
     assert any(line.error is not None for line in lines)
     # The first link's trace replays the bring-up without the board.
     replayed = ReplayedWords(files[0])
-    replayed_board = make_radar_board(rig, "LS", replayed, replayed, None)
+    # A trace is both the link to the board and its clock.
+    replayed_board = make_radar_board(rig, "LS", words=replayed, clock=replayed, firmware=None)
     replayed_board.configure()
     replayed_board.arm(FRAMES)
 

@@ -177,7 +177,7 @@ def test_the_chirp_spacing_must_be_that_of_the_radar(rig, chirp_us, holds):
 
 
 def test_a_frame_of_many_chirps_needs_a_longer_period(rig):
-    # As for one chirp, 300 and 200 us follow.
+    # As after a single chirp, 300 us must follow, and 200 us to the next pulse.
     chirps_us = 16 * 228.51
     for period, holds in ((chirps_us + 500.0 + 1e-3, True), (chirps_us + 499.0, False)):
         burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=period)
@@ -193,7 +193,7 @@ def test_the_bypass_of_a_boards_regulators_has_to_be_confirmed_by_its_serial_num
 
 def test_the_serial_number_of_another_board_does_not_confirm_the_bypass(rig):
     def acknowledge_bypass(acknowledged: str) -> Instrument:
-        native = {**rig.radar.native, "RH": NativeRadar("FTRH", True, acknowledged)}
+        native = {**rig.radar.native, "RH": NativeRadar("FTRH", ldo_bypass=True, ldo_bypass_acknowledged=acknowledged)}
         return change_radar_table(rig, native=native)
 
     for serial in ("", "FTRV"):

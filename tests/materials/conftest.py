@@ -167,6 +167,9 @@ def name_placement(library):
 def library(analyse_placement) -> Library:
     """A library of six placements, none of which is the scene of a test that uses the library."""
     return make_library(
-        [TrainingScan(f"train-{s}", analyse_placement(s), True, {"made by": "test"}) for s in range(1000, 1006)],
+        [
+            TrainingScan(f"train-{s}", analyse_placement(s), simulated=True, versions={"made by": "test"})
+            for s in range(1000, 1006)
+        ],
         note="synthetic images",
     )

@@ -173,7 +173,7 @@ def test_the_command_names_the_patches_of_two_scans(folders, capsys):
     assert answer["source"] == "simulated"
     assert answer["incidence_deg"] == pytest.approx(ANGLES)
     assert answer["model"] == DISCRIMINANT_MODEL
-    # All of the nine patches but one, as above
+    # All of the nine patches but one are named right, as above.
     is_right = [p["name"] == p["truth"] for p in answer["patches"]]
     assert sum(is_right) >= 8
     assert main([*arguments, "--model", "knn"]) == 0

@@ -89,6 +89,7 @@ def test_a_concentration_is_judged_without_its_own_patches():
     entries = (*make_library_of_sugar().entries, *odd_entries)
     result = fit_concentration(Library(entries), {"water": 0.0})
     predictions = [r.percent for r in result.left_out if r.true_percent == 9.0]
+    # Entries hold P in single precision, as above.
     assert predictions == pytest.approx([-20.0] * 3, abs=1e-3)
 
 

@@ -263,7 +263,7 @@ def test_paint_on_the_metal_is_recognised_and_the_permittivities_are_within_thei
     # Probability of paint
     assert result.painted > 0.8
     assert result.paint_mm == pytest.approx(paint_mm, abs=0.04)
-    # All but one of the eight plates
+    # The 95 % regions of all plates but one hold the truth: at least seven of eight.
     assert sum(distance < CHI2_95 for distance in compute_distances(result)) >= 7
 
 
@@ -283,7 +283,7 @@ def test_error_bars_contain_paint_that_is_not_certain():
         result = invert(painted_plates, RigPrior(theta_std_rad=1e-3), KINDS)
         probabilities.append(result.painted)
         is_covered += [distance < CHI2_95 for distance in compute_distances(result, eps)]
-    # They are 0.30 to 0.75.
+    # The probabilities are 0.30 to 0.75.
     assert min(probabilities) > 0.05
     assert max(probabilities) < 0.95
     # 95 % are expected; of 32 plates two standard deviations less: sqrt(0.95 * 0.05 / 32) = 0.039.
@@ -307,7 +307,7 @@ def test_names_have_both_cases_of_metal_that_may_be_painted():
             difference = case.inverse_ratio - middle
             parts = np.array([difference.real, difference.imag])
             covariance += case.probability * (case.covariance + np.outer(parts, parts))
-        # They agree to 0.2 % here.
+        # The covariances agree to 0.2 % here.
         assert estimate.evidence.covariance == pytest.approx(covariance, rel=0.03, abs=1e-6)
 
 
@@ -340,7 +340,7 @@ def test_paint_is_an_error_of_the_reference_from_a_probability_of_a_fifth():
         # units of its prior. Patches only reduce its variance, from 1.
         variance_of_reference_phase = np.diag(result.nuisance_covariance)[5]
         assert (variance_of_reference_phase > 2) == (result.painted > 0.2)
-    # 0.16 and 0.24
+    # The probabilities are 0.16 and 0.24.
     assert 0.05 < probabilities[0] < 0.2 < probabilities[1]
 
 

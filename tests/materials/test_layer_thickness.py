@@ -100,7 +100,7 @@ def test_differences_between_bands_are_known_better_than_each():
     bands_independent = measure_bands([SHEET], covariance=independent_covariance)
     shared = fit_layer(bands_shared, [Layer("sheet")], THETA, NARROW_RANGE_M)
     independent = fit_layer(bands_independent, [Layer("sheet")], THETA, NARROW_RANGE_M)
-    # 0.53 of it
+    # The standard deviation is 0.53 times as large.
     assert shared.std_thickness_m < 0.7 * independent.std_thickness_m
 
 
@@ -128,7 +128,7 @@ def test_an_uncertain_angle_widens_the_error_bars():
     known_angle = fit_layer(measure_bands([SHEET], theta_std=0), [Layer("sheet")], THETA, NARROW_RANGE_M)
     # 0.01 rad is 0.6 degrees.
     uncertain_angle = fit_layer(measure_bands([SHEET], theta_std=0.01), [Layer("sheet")], THETA, NARROW_RANGE_M)
-    # Four times as large
+    # The error bar becomes four times as large.
     assert uncertain_angle.std_real > 1.1 * known_angle.std_real
 
 
@@ -137,7 +137,7 @@ def test_an_uncertain_angle_widens_the_error_bars():
     [
         ("glass,5.5,0.05,3", Layer("glass", 5.5 - 0.05j, 3e-3)),
         ("water, 9.37, 18", Layer("water", 9.37 - 18j)),
-        ("sheet,?,0.5", Layer("sheet", None, 0.5e-3)),
+        ("sheet,?,0.5", Layer("sheet", thickness_m=0.5e-3)),
         ("liquid,?", Layer("liquid")),
         ("sheet,?,0.5-3", Layer("sheet", thickness_range_m=(0.5e-3, 3e-3))),
         ("sheet, ?, ?", Layer("sheet", thickness_range_m=(0.1e-3, 12e-3))),
@@ -230,8 +230,9 @@ def test_products_without_patches_print_none_and_their_verdict(folder, capsys):
 
 
 def test_products_without_the_covariance_of_their_bands_count_as_one_band(folder):
-    """Products of earlier releases lack it. Four bands whose errors are independent and twice as large are as good as
-    one band.
+    """Products of earlier releases lack the covariance, so their errors count as independent and twice as large.
+
+    Four independent errors that are twice as large leave as much as the error of one band.
     """
     row = ScanMaterials.read(folder / "materials.json").segments[0]
     with_covariance = bands_of_row(row, CHIRP, 4)

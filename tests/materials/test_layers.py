@@ -54,7 +54,7 @@ def test_a_half_space_is_eq2_and_eq3():
 def test_a_sheet_of_known_thickness_is_recovered(real, loss, thickness):
     eps = complex(real, -loss)
     bands = measure_bands([Layer("sheet", eps, thickness)])
-    fit = fit_layer(bands, [Layer("sheet", None, thickness)], THETA)
+    fit = fit_layer(bands, [Layer("sheet", thickness_m=thickness)], THETA)
     assert compute_distance_of_nearest_solution(fit, eps) < 1e-3 * abs(eps)
 
 
@@ -91,7 +91,7 @@ def test_water_behind_glass_is_measured_by_the_stack_where_eq3_is_wrong_by_a_fac
 
 def test_error_bars_are_those_of_repeated_measurements():
     stack = [Layer("pvc", 4.15 - 0.81j, 1.5e-3)]
-    unknown = [Layer("pvc", None, 1.5e-3)]
+    unknown = [Layer("pvc", thickness_m=1.5e-3)]
     rng = np.random.default_rng(1)
     fits = [fit_layer(measure_bands(stack, sigma=0.01, rng=rng), unknown, THETA) for _ in range(60)]
     # Some find another solution, with another number of half waves in the sheet: the error bar is that of one solution.
@@ -121,7 +121,7 @@ def test_error_bars_grow_faster_than_large_noise():
 def test_several_permittivities_that_fit_are_reported():
     """The ratio of one narrow band repeats with every half wave in the sheet; the whole sweep distinguishes them."""
     eps = 7.0 - 0.1j
-    sheet = [Layer("sheet", None, 2e-3)]
+    sheet = [Layer("sheet", thickness_m=2e-3)]
     one_frequency = Spectrum(np.array([[76.3e9]]), np.array([[1.0]]))
     bands = measure_bands([Layer("sheet", eps, 2e-3)], sigma=0.005, spectrum=one_frequency)
     narrow = fit_layer(bands, sheet, THETA)
@@ -166,7 +166,7 @@ def test_two_solutions_that_fit_equally_are_reported_with_what_would_distinguish
 
 def test_a_stack_that_is_not_the_one_measured_is_noticed():
     bands = measure_bands([GLASS, Layer("water", WATER)], sigma=0.003)
-    fit = fit_layer(bands, [Layer("sheet", None, 0.2e-3)], THETA)
+    fit = fit_layer(bands, [Layer("sheet", thickness_m=0.2e-3)], THETA)
     assert any("does not explain" in w for w in fit.warnings())
 
 
@@ -175,7 +175,7 @@ def test_a_stack_that_is_not_the_one_measured_is_noticed():
     [
         # No unknown layer, two of them, and a layer without thickness before another
         ([GLASS], ErrorCode.VALUES_CONFLICT),
-        ([Layer("a", None, 1e-3), Layer("b")], ErrorCode.VALUES_CONFLICT),
+        ([Layer("a", thickness_m=1e-3), Layer("b")], ErrorCode.VALUES_CONFLICT),
         ([Layer("a", 2.0), Layer("b")], ErrorCode.KEY_MISSING),
     ],
 )
@@ -189,7 +189,7 @@ def test_fewer_data_than_unknowns_are_refused():
     bands = measure_bands([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.from_chirp(CHIRP, 1))
     # One sub-band has two numbers; unknown are permittivity (two) and thickness.
     with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
-        fit_layer(bands, [Layer("sheet", None, 1e-3)], THETA, thickness_range_m=(0.5e-3, 2e-3))
+        fit_layer(bands, [Layer("sheet", thickness_m=1e-3)], THETA, thickness_range_m=(0.5e-3, 2e-3))
 
 
 def test_a_solution_at_the_end_of_the_search_range_is_reported():
@@ -212,7 +212,7 @@ def test_a_misfit_that_one_scan_in_a_thousand_has_is_reported():
 def test_a_misfit_keeps_the_rivals_that_the_stated_errors_would_exclude():
     """Data with an error of 8 % that is stated, or that is not: then error bars are stretched until the data fit."""
     v_over_h, _ = predict([Layer("sheet", 4 - 0.1j, 3e-3)], BANDS, THETA)
-    unknown = [Layer("sheet", None, 3e-3)]
+    unknown = [Layer("sheet", thickness_m=3e-3)]
     stated_error = Bands(BANDS, v_over_h * 1.08, sigma=np.full(v_over_h.size, 0.02))
     unstated_error = replace(stated_error, sigma=np.full(v_over_h.size, 0.002))
     fit = fit_layer(stated_error, unknown, THETA)

@@ -31,13 +31,13 @@ def test_library_round_trips(tmp_path, library):
     assert reloaded.fit == json.loads(json.dumps(library.fit))
     assert reloaded.note == "synthetic images"
     assert reloaded.simulated
-    for a, b in zip(library.entries, reloaded.entries, strict=True):
-        assert b.name == a.name
-        assert b.scan == a.scan
-        assert b.permittivity == a.permittivity
-        assert b.versions == a.versions
-        np.testing.assert_array_equal(a.h, b.h)
-        np.testing.assert_array_equal(a.p, b.p)
+    for entry, reloaded_entry in zip(library.entries, reloaded.entries, strict=True):
+        assert reloaded_entry.name == entry.name
+        assert reloaded_entry.scan == entry.scan
+        assert reloaded_entry.permittivity == entry.permittivity
+        assert reloaded_entry.versions == entry.versions
+        np.testing.assert_array_equal(entry.h, reloaded_entry.h)
+        np.testing.assert_array_equal(entry.p, reloaded_entry.p)
     assert [p.name for p in tmp_path.iterdir()] == ["l.npz"]
 
 

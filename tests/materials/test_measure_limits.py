@@ -188,7 +188,7 @@ def test_scatter_is_that_of_amplitude_and_phase():
     assert scatter.centre_m == pytest.approx((0.039, 0.029))
     assert scatter.level == pytest.approx(0.5, rel=0.01)
     assert scatter.relief_rad == pytest.approx(0.0, abs=1e-9)
-    # Error of the slope of a straight line through so many independent values with this scatter
+    # Error of the slope of a straight line through as many values as there are independent places, with this scatter
     for axis_m, std in ((X_M, scatter.slope_std[0]), (Y_M, scatter.slope_std[1])):
         std_per_scatter = 1 / np.sqrt(scatter.blocks) / np.std(axis_m)
         assert (std.real, std.imag) == pytest.approx((0.03 * std_per_scatter, 0.05 * std_per_scatter), rel=0.1)

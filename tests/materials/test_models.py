@@ -31,20 +31,23 @@ def draw_samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=
     and `angle` a change of V / H of all materials.
     """
     rng = np.random.default_rng(seed)
-    x = []
-    names = []
-    group = []
-    patch = []
-    for g in range(groups):
-        for m in range(materials):
-            patch_ratio = 0.1 + 0.05 * m + angle + 0.02j * m + offset * complex(*rng.standard_normal(2))
+    features = []
+    name_of_pixel = []
+    group_of_pixel = []
+    patch_of_pixel = []
+    for group in range(groups):
+        for material in range(materials):
+            material_ratio = 0.1 + 0.05 * material + angle + 0.02j * material
+            patch_ratio = material_ratio + offset * complex(*rng.standard_normal(2))
             v_over_h = patch_ratio + noise * (rng.standard_normal(pixels) + 1j * rng.standard_normal(pixels))
-            h = 0.7 + 0.002 * m + noise * rng.standard_normal(pixels)
-            x.append(make_features(h, np.abs(v_over_h) * h, 1 / v_over_h))
-            names += [f"m{m}"] * pixels
-            group += [f"s{g}"] * pixels
-            patch += [g * materials + m] * pixels
-    return Samples(np.concatenate(x), np.array(names), np.array(group), np.array(patch))
+            h = 0.7 + 0.002 * material + noise * rng.standard_normal(pixels)
+            features.append(make_features(h, np.abs(v_over_h) * h, 1 / v_over_h))
+            name_of_pixel += [f"m{material}"] * pixels
+            group_of_pixel += [f"s{group}"] * pixels
+            patch_of_pixel += [group * materials + material] * pixels
+    return Samples(
+        np.concatenate(features), np.array(name_of_pixel), np.array(group_of_pixel), np.array(patch_of_pixel)
+    )
 
 
 def shuffle_names(data, seed=0):
@@ -141,7 +144,7 @@ def test_a_split_by_pixel_needs_two_pixels_of_a_material():
 def test_a_split_by_pixel_gives_too_high_an_accuracy():
     """Common errors of a patch's pixels are memorised if its pixels are on both sides of the split."""
     data = draw_samples(pixels=10, offset=0.03, noise=0.003)
-    # 0.86 by pixel, and 0.63 by scan
+    # The accuracy is 0.86 by pixel, and 0.63 by scan.
     assert score(data, PAPER_MODEL, by_pixel=True).pixels > score(data, PAPER_MODEL).pixels + 0.15
 
 
@@ -272,7 +275,7 @@ def test_the_median_of_each_patch_is_that_of_its_values_alone(seed, patches, odd
     rng = np.random.default_rng(seed)
     # Each patch has a pixel at least, and twelve more are of any patch.
     patch = rng.permutation(np.concatenate([np.arange(patches), rng.integers(0, patches, 12)]))
-    # Of few values, so that many are alike.
+    # There are only four different values, so that many pixels have the same.
     values = rng.integers(0, 4, patch.size) / 4
     values[rng.integers(patch.size)] = odd_one
     expected = [np.median(values[patch == i]) for i in range(patches)]

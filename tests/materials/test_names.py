@@ -145,7 +145,7 @@ def test_brightness_distinguishes_thin_plates_from_half_spaces_of_the_same_ratio
 
 def test_brightness_of_unevenly_lit_plates_is_weak_evidence():
     thin, thick = compute_layer_probability(60, brightness_std=0.6)
-    # 0.16 and 0.14, compared with 0.71 and less than 0.05 of the test above
+    # The probabilities are 0.16 and 0.14. In the test above they are 0.71 and less than 0.05.
     assert abs(thin - thick) < 0.2
 
 
@@ -184,11 +184,15 @@ def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
     width_hz = BAND_HZ[1] - BAND_HZ[0]
     layered = []
     for _ in range(100):
-        eps = rng.uniform(2, 7) * (1 - 1j * rng.uniform(0.001, 0.05))
-        stack = [eps, rng.uniform(2, 9) * (1 - 1j * rng.uniform(0, 1.5))], [rng.uniform(1e-3, 5e-3), np.inf]
+        plate_eps = rng.uniform(2, 7) * (1 - 1j * rng.uniform(0.001, 0.05))
+        half_space_eps = rng.uniform(2, 9) * (1 - 1j * rng.uniform(0, 1.5))
+        permittivities = [plate_eps, half_space_eps]
+        thicknesses_m = [rng.uniform(1e-3, 5e-3), np.inf]
         # The change over a tenth of the sweep, times ten: a plate's phase changes by several turns over the whole.
-        low = np.log(np.array(multilayer(*stack, centre_hz - 0.05 * width_hz, ANGLES[0])))
-        high = np.log(np.array(multilayer(*stack, centre_hz + 0.05 * width_hz, ANGLES[0])))
+        low_hz = centre_hz - 0.05 * width_hz
+        high_hz = centre_hz + 0.05 * width_hz
+        low = np.log(np.array(multilayer(permittivities, thicknesses_m, low_hz, ANGLES[0])))
+        high = np.log(np.array(multilayer(permittivities, thicknesses_m, high_hz, ANGLES[0])))
         change_of_s, change_of_p = (high - low) / 0.1
         change_of_ratio = change_of_p - change_of_s
         change = np.array([change_of_s.real, change_of_ratio.real, change_of_ratio.imag])
@@ -227,7 +231,7 @@ def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
 
     constant = name_with_change(np.zeros(3))
     assert constant.name == "wood"
-    # 0.988; a ratio that is exactly that of wood leaves little to other materials.
+    # The confidence is 0.988: a ratio that is exactly that of wood leaves little to other materials.
     assert constant.confidence > 0.9
     assert name_with_change(np.array([0.2, -0.1, 0.3])).name == LAYER
 
@@ -250,14 +254,17 @@ def test_each_reason_of_a_name_has_a_subject():
     sapphire = 9.41 - 0.002j
     named = name_ratios(complex(inverse_ratio(sapphire, ANGLES[0])), std=0.001, share=0.2)
     for permittivity, beginning in ((None, "it is like "), (sapphire, "permittivity 9.41 - j0.00 is like ")):
-        assert add_explanation(named, permittivity, None, LIBRARY).patch_name.why.startswith(beginning)
+        explained = add_explanation(named, permittivity, covariance=None, library=LIBRARY)
+        assert explained.patch_name.why.startswith(beginning)
 
 
 @pytest.mark.parametrize(("unknown", "rival"), [(0.5, "a material that the library lacks 50 %"), (0.001, "no other")])
 def test_a_likely_unknown_material_is_listed_as_a_rival(unknown, rival):
     named = name_ratios(complex(inverse_ratio(LIBRARY["acrylic"], ANGLES[0])))
     patch_name = replace(named.patch_name, probabilities={"acrylic": 1 - unknown, UNKNOWN: unknown})
-    reason = add_explanation(replace(named, patch_name=patch_name), LIBRARY["acrylic"], None, LIBRARY).patch_name.why
+    named_with_rival = replace(named, patch_name=patch_name)
+    explained = add_explanation(named_with_rival, LIBRARY["acrylic"], covariance=None, library=LIBRARY)
+    reason = explained.patch_name.why
     assert reason.partition("; ")[2].removeprefix("it could also be ").startswith(rival)
 
 

@@ -89,7 +89,7 @@ def test_a_plate_at_the_end_of_the_lit_area_has_a_larger_error(synthetic):
     lit = everywhere.copy()
     lit[:, columns[-1] - 7 :] = False
     at_border = measure_with_separate_metal(scene, lit, segmentation)
-    # 2.9 times as large
+    # The error becomes 2.9 times as large.
     assert at_border[patch.label] > 1.2 * inside[patch.label]
 
 
@@ -98,7 +98,7 @@ def test_a_plate_that_fills_the_lit_area_has_no_error_of_its_border(synthetic):
     scene = synthetic(seed=3)
     patch = scene.analyse().segmentation.patches[0]
     assert estimate_border_errors(patch, patch.mask, scene.x_m) == (0.0, 0.0)
-    # Metal whose edges are a pixel farther out: 6 % in amplitude and 3 % in phase
+    # With metal whose edges are a pixel farther out, the errors are 6 % in amplitude and 3 % in phase.
     lit = ndimage.binary_dilation(patch.mask)
     assert min(estimate_border_errors(patch, lit, scene.x_m)) > 0.005
     assert estimate_border_errors(patch, np.ones(patch.mask.shape, bool), scene.x_m) == (0.0, 0.0)

@@ -65,7 +65,7 @@ def test_the_reference_of_unevenly_lit_metal_is_its_median_ratio_as_of_other_pla
     scene = dim_copper(*draw_plates())
     segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     metal = take_patch_as_metal(int(segmentation.labels[30, 30]), segmentation)
-    relative = divide_by_reference(scene, metal, None)
+    relative = divide_by_reference(scene, metal, reference=None)
     # The median ratio of the metal itself becomes 1 (to 5e-6), although the light on the metal changes V / H.
     assert abs(compute_median_ratio(relative.h[metal.mask], relative.v[metal.mask]) - 1) < 1e-4
     # 0.019 is how much V / H varies; it is also what the root mean squares differ from the median by.
@@ -81,7 +81,7 @@ def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
         known_scene = KnownScene(segmentation=segmentation, metal=int(segmentation.labels[30, 30]))
         result = analyse(scene, Optics(np.radians(55.0)), known_scene)
         errors.append(result.prior.reference_std)
-        uneven = measure_metal_unevenness(divide_by_reference(scene, result.metal, None), result.metal.mask)
+        uneven = measure_metal_unevenness(divide_by_reference(scene, result.metal, reference=None), result.metal.mask)
         assert errors[-1] >= 0.5 * uneven
     assert errors[1] > 1.5 * errors[0]
 
@@ -92,7 +92,7 @@ def test_images_of_h_and_v_that_are_displaced_are_aligned(shift_px):
     # Rows (y) and columns (x) of 2 mm
     moved = ndimage.shift(v, shift_px, order=3)
     aligned, displacement_mm = align(make_images(h, moved))
-    # To a fifth of a pixel
+    # The displacement is found to a fifth of a pixel, 0.4 mm.
     assert displacement_mm == pytest.approx((2 * shift_px[1], 2 * shift_px[0]), abs=0.4)
     # The border has no data after a shift.
     inside = np.s_[10:110, 10:110]
@@ -110,6 +110,11 @@ def test_images_of_noise_are_not_displaced():
     rng = np.random.default_rng(1)
     h, v = rng.standard_normal((2, SIDE, SIDE)) + 1j * rng.standard_normal((2, SIDE, SIDE))
     assert align(make_images(h, v))[1] == (0.0, 0.0)
+
+
+def look_up(slopes):
+    """Return a function for `make_scatter` that takes the slopes of each plate from a table, by the plate's place."""
+    return lambda x_m, y_m: slopes[x_m, y_m]
 
 
 def make_scatter(slope_of, slope_std=0.1):
@@ -179,10 +184,8 @@ def test_any_drift_is_within_its_error():
         slope = np.interp(rows_m, along_m, np.gradient(drift, along_m))
         # Images show about nine tenths of a slope, with an error.
         measured_slope = 0.9 * slope + slope_std * (rng.standard_normal(9) + 1j * rng.standard_normal(9))
-        slopes = dict(zip(PLACES_M, measured_slope, strict=True))
-        change = estimate_common_change(
-            make_scatter(lambda x, y, slopes=slopes: (0j, slopes[x, y]), slope_std), ORIGIN_M
-        )
+        slopes = {place: (0j, along_y) for place, along_y in zip(PLACES_M, measured_slope, strict=True)}
+        change = estimate_common_change(make_scatter(look_up(slopes), slope_std), ORIGIN_M)
         # Changes are relative to the row of the metal.
         in_other_rows = rows_m != ORIGIN_M[1]
         true_change = true_change - true_change[PLACES_M.index(ORIGIN_M)]
@@ -241,7 +244,7 @@ def test_long_fringes_are_within_the_error():
         fringes = 0.12 * np.exp(1j * (places @ wave_vector + phase))
         # The derivative of exp(i k . place) is i k exp(i k . place).
         slopes = dict(zip(PLACES_M, 1j * fringes[:, None] * wave_vector, strict=True))
-        change = estimate_common_change(make_scatter(lambda x, y, slopes=slopes: slopes[x, y]), ORIGIN_M)
+        change = estimate_common_change(make_scatter(look_up(slopes)), ORIGIN_M)
         true_change = fringes - fringes[PLACES_M.index(ORIGIN_M)]
         for place in range(len(PLACES_M)):
             if PLACES_M[place] == ORIGIN_M:
@@ -258,7 +261,7 @@ def test_a_disturbed_plate_gets_a_large_error_and_the_others_do_not():
     """A copy of another plate on it makes its slopes unlike all others."""
     disturbed = make_scatter(lambda x, y: (8 + 6j, 5j) if (x, y) == PLACES_M[0] else (0j, 0j))
     error_by_ripple = estimate_common_change(disturbed, ORIGIN_M).ripple
-    # 7.5 % for the disturbed plate, and nothing for the others
+    # The disturbed plate gets an error of 7.5 %, and the others get none.
     assert error_by_ripple[0] > 0.05
     assert error_by_ripple[1:].max() == 0
 
@@ -277,7 +280,7 @@ def test_a_halo_around_the_metal_in_v_alone_shows_an_overdriven_receiver():
     patches = segment(h, v, AXIS, AXIS).patches
     metal = next(p for p in patches if np.median(np.abs(v[p.interior])) > 0.8)
     assert find_halo(metal.interior, patches, pair).level == 0
-    # A third of the metal, blurred over 16 mm
+    # The glow is 30 % of the metal's amplitude, blurred over 16 mm.
     glow = 0.3 * ndimage.gaussian_filter(metal.mask.astype(float), 8.0)
     halo = find_halo(metal.interior, patches, make_images(h, v + glow))
     assert halo.level > 0.005

@@ -26,7 +26,7 @@ def test_nine_plates_are_nine_patches_inside_their_true_boxes(synthetic, seed):
         np.testing.assert_allclose(patch.box_mm, truth, atol=5.0)
         inside = box_mask(truth, scene.x_m, scene.y_m)
         assert not (patch.interior & ~inside).any()
-        # Of 506 pixels of a plate of 45 mm; the paper uses 80 to 120 for each material.
+        # A plate of 45 mm has 506 pixels, and the paper uses 80 to 120 for each material.
         assert patch.interior.sum() > 80
         assert patch.pixels == patch.mask.sum()
         assert (segmentation.labels[patch.mask] == patch.label).all()
@@ -113,7 +113,7 @@ def test_the_outline_of_a_patch_reaches_to_its_box(synthetic):
     scene = synthetic(seed=4)
     segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m, settings=SegmentSettings(margin_mm=6.0))
     for patch in segmentation.patches:
-        # To a pixel of 2 mm
+        # An outline reaches to its box within a pixel of 2 mm.
         np.testing.assert_allclose(patch.outline_mm.min(axis=0), patch.box_mm[:2], atol=2.1)
         np.testing.assert_allclose(patch.outline_mm.max(axis=0), patch.box_mm[2:], atol=2.1)
 
@@ -144,7 +144,7 @@ def test_metal_may_be_given_by_a_box_or_by_the_number_of_a_patch(synthetic):
 
 def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
     scene = synthetic(seed=0)
-    # In pixels
+    # Corners in pixels
     boxes = {"acrylic": (10.0, 20.0, 30.0, 35.0), "copper": (60.0, 60.0, 80.0, 82.0)}
     (tmp_path / "l.json").write_bytes(pack_labels(Labels(boxes)))
     assert read_labels(tmp_path / "l.json").boxes == boxes

@@ -47,7 +47,7 @@ def test_pixels_that_are_not_valid_are_not_measured_and_a_box_of_them_has_no_res
     # A third of the left plate, and the whole box "nowhere"
     valid[:, :12] = False
     valid[:, 58:] = False
-    # As in images
+    # Images are 0 where they are not valid.
     h[~valid] = 0
     v[~valid] = 0
     pair = Images(h, v, X_M, Y_M, valid)

@@ -127,4 +127,4 @@ def test_a_plate_near_the_brewster_angle_is_not_called_disturbed():
     # The disturbance is 16 % of the plate's own V, but changes its permittivity by 0.1 % only.
     assert analysis.disturbed[label] > 0.05
     assert analysis.errors_by_disturbance()[label] < 0.01
-    assert not any("changes within" in reason.what for reason in scene_reasons(analysis, None, None))
+    assert not any("changes within" in reason.what for reason in scene_reasons(analysis, plane=None, classifier=None))

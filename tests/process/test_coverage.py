@@ -22,7 +22,7 @@ METAL = "-40,10,30,30"
 COLUMNS = 15
 ROWS = 17
 PULSES = 2
-# Of two boards
+# Frames of both receivers together
 FRAMES = 2 * COLUMNS * ROWS * PULSES
 
 

@@ -279,7 +279,7 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
     degrees = (0.6, -0.8)
     axis = np.arange(150) * 2e-3
     height_m = np.tan(np.radians(degrees[0])) * axis[None, :] + np.tan(np.radians(degrees[1])) * axis[:, None]
-    # About the middle of the sweep
+    # 78 GHz is about the middle of the sweep.
     wave_number = 2 * np.pi * 78.0e9 / 299792458.0
     # The drawn files have a phase of their own that grows by a turn in 900 pixels along both axes, see write_labels.
     turns = np.arange(150) / 900.0

@@ -117,7 +117,7 @@ def test_the_leakage_of_a_rig_is_recovered_from_a_known_material(image_scene, di
     measured = np.sum(calibrated.h[plate_pixels]) / np.sum(calibrated.v[plate_pixels])
     # With the same leakage a of both boards P = (t + a) / (1 + a t) is measured of a true ratio t.
     estimate = (measured - true) / (1 - measured * true)
-    # It is found to 0.0016 of 0.05 or 0.085; with the true leakage removed, P of the ceramic is right to 0.4 %.
+    # The leakage of 0.05 or 0.085 is found to 0.0016. With the true one removed, P of the ceramic is right to 0.4 %.
     assert abs(estimate - leakage) < 0.012
     h, v = correct_leakage(calibrated.h, calibrated.v, leakage, leakage)
     corrected = np.sum(h[plate_pixels]) / np.sum(v[plate_pixels])

@@ -79,13 +79,14 @@ def test_the_right_order_and_a_dead_rx_are_not_reported_as_another_order(process
 @pytest.mark.parametrize(("board", "order"), [("RV", (2, 1, 3, 4)), ("RH", (4, 3, 2, 1))])
 def test_another_order_in_cubes_is_reported(process_six_plates, board, order):
     cubes = Cubes(load_published_rig(), decode_scene(SCENE, "test"))
-    # Synchronised cubes have no phases of the direct path. Those of before synchronisation show the order of the RX.
+    # A synchronised cube has no phases of the direct path. They are restored here, because they show the order of the
+    # RX.
     setups = {b.name: BoardSetup.from_rig(load_published_rig(), b) for b in cubes.instrument.receivers}
 
     def mangle(name: str, row: int, samples: np.ndarray) -> None:
         path = setups[name].path
-        # In the middle of the chirp
-        lags = np.angle(path.steering[:, 96])
+        middle_of_chirp = 96
+        lags = np.angle(path.steering[:, middle_of_chirp])
         rng = np.random.default_rng(row)
         # [position, sample, 1, rx]
         random_phase = np.exp(2j * np.pi * rng.random((len(samples), 1, 1, 1)))

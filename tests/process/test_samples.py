@@ -245,7 +245,8 @@ def test_samples_are_kept_only_with_the_usual_range_of_paths(needed_m, is_covere
     """Samples of an image that needs other paths would be of no use to the next one."""
     samples = SimpleNamespace(_head={}, _keep=True)
     usual_m = (0.1, 1.0)
-    assert KeptSamples._gate_m(samples, None, needed_m, usual_m) == (usual_m if is_covered else needed_m)
+    gate_m = KeptSamples._gate_m(samples, rig=None, needed_gate_m=needed_m, usual_gate_m=usual_m)
+    assert gate_m == (usual_m if is_covered else needed_m)
     assert samples._keep is is_covered
 
 

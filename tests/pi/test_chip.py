@@ -123,7 +123,8 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
         # The program's stamps are from before its call, the chip's from within it.
         assert c.edge_ns < c.first_pulse_ns <= burst[0]
         assert c.last_pulse_ns <= burst[-1] <= c.last_pulse_ns + c.width_max_ns
-        assert all(b - a >= 300_000 for a, b in pairwise(burst)), "never closer than the radar allows"
+        # The radar needs 300 us between two pulses.
+        assert all(later - earlier >= 300_000 for earlier, later in pairwise(burst))
     status, _, err = program.end()
     assert status == 0, err
     wires.wait_until(lambda: wires.read_level(SYNC) == 0)
@@ -153,7 +154,7 @@ def test_a_chip_that_vanishes_is_a_lasting_fault_of_the_trigger_line(long_bursts
 
 
 def test_a_line_in_use_ends_the_program_with_fault_and_remedy(rig, write_config, stage, hub):
-    """The other faults of a chip are those of `polysight-pi check` (test_checks.py): the same code opens the lines."""
+    """test_checks.py has the other faults of a chip: the same code opens the lines for `polysight-pi check`."""
     environment = gpio.environment(rig.pi.gpio_chip, hub, faults=("busy:22",))
     process = run("run", "--config", write_config(rig), "--stage-port", stage.port, **environment)
     assert process.returncode == DeviceError.exit_status
@@ -169,7 +170,8 @@ def test_outputs_are_low_after_a_signal_inside_a_pulse(rig, in_row, wires, numbe
     program, _ = in_row(rig, "stuck")
     wires.wait_until(lambda: wires.read_level(SYNC) == 1)
     status, _, err = program.end(number)
-    assert status == (0 if number == signal.SIGTERM else -signal.SIGKILL), err
+    expected_status = 0 if number == signal.SIGTERM else -signal.SIGKILL
+    assert status == expected_status, err
     wires.wait_until(lambda: wires.read_level(SYNC) == 0)
     assert len(wires.list_rises(SYNC)) == 1
 
@@ -355,7 +357,7 @@ def may_schedule():
 
 
 def read_priorities(pid):
-    """Return the real-time priorities of those threads of a process that have one."""
+    """Return the real-time priorities of the threads of a process; threads without one are left out."""
     tasks = [int(t.name) for t in Path(f"/proc/{pid}/task").iterdir()]
     return [os.sched_getparam(t).sched_priority for t in tasks if os.sched_getscheduler(t) == os.SCHED_FIFO]
 

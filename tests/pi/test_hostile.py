@@ -316,7 +316,7 @@ def is_cut(peer: socket.socket) -> bool:
 
 
 def wait_a_turn(frames: bytes) -> bytes:
-    """Return the frames after a pause: at most so many turns a second."""
+    """Return the frames after a pause, so that there are at most `TURNS_A_SECOND`."""
     time.sleep(1 / TURNS_A_SECOND)
     return frames
 

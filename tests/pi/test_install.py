@@ -141,7 +141,8 @@ def test_pinned_versions_are_what_the_wheels_ask_for():
 
 
 def test_udev_rules_are_well_formed():
-    lines = [x for x in (PI / "60-polysight.rules").read_text().splitlines() if x and not x.startswith("#")]
+    all_lines = (PI / "60-polysight.rules").read_text().splitlines()
+    lines = [line for line in all_lines if line and not line.startswith("#")]
     # The rules were found.
     assert len(lines) >= 4
     # KEY=="value", KEY{attribute}=="value", or an assignment with = or +=.

@@ -498,7 +498,10 @@ def test_every_state_can_be_reached_and_left_and_an_event_has_one_rule_in_it():
                 to_visit += [next_state for next_state in rule.leads_to.split() if next_state != "same"]
     assert reached == states
 
-    states_that_may_lose_the_stage = {s for rule in RULES if rule.event == "stage lost" for s in rule.states.split()}
+    states_that_may_lose_the_stage = set()
+    for rule in RULES:
+        if rule.event == "stage lost":
+            states_that_may_lose_the_stage.update(rule.states.split())
     assert states_that_may_lose_the_stage == states
 
 

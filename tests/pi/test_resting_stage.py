@@ -1,4 +1,4 @@
-"""A stage that rests in a motion without a report of the motion's end is noticed by its statuses alone."""
+"""A stage that rests although it has not reported the end of its motion is noticed by its statuses."""
 
 import pytest
 from tests.support.pi.machine_bench import Bench
@@ -8,10 +8,13 @@ from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
 from polysight_shared.stage_line import Reply
 
+# Number of statuses of rest after which the Pi has asked the stage often enough to repeat its report.
+MOST_RESTING_STATUSES = RESTING_STATUSES * MAX_REPEAT_REQUESTS
 JOG = m.Jog(axis="x", from_mm=0.0, distance_mm=5.0, speed_mm_s=10.0, heartbeat_ms=500, owner="o")
 
 
 def begin(motion: str) -> Bench:
+    """A bench whose stage has accepted this motion."""
     bench = Bench().begin_and_home()
     if motion == "row":
         bench.start()
@@ -28,9 +31,9 @@ def begin(motion: str) -> Bench:
 
 
 @pytest.mark.parametrize("motion", ["row", "jog", "homing"])
-def test_a_stage_that_rests_in_any_motion_is_a_fault_after_it_was_asked_for_its_end(motion):
+def test_a_stage_that_rests_and_does_not_repeat_its_report_is_a_fault(motion):
     bench = begin(motion)
-    for _ in range(RESTING_STATUSES * MAX_REPEAT_REQUESTS):
+    for _ in range(MOST_RESTING_STATUSES):
         bench.send_status(0, state="idle")
     assert bench.machine.fault == 0
     bench.send_status(0, state="idle")
@@ -38,10 +41,10 @@ def test_a_stage_that_rests_in_any_motion_is_a_fault_after_it_was_asked_for_its_
 
 
 @pytest.mark.parametrize("motion", ["row", "jog", "homing"])
-def test_statuses_count_only_in_sequence(motion):
+def test_only_consecutive_statuses_of_rest_count(motion):
     bench = begin(motion)
     for _ in range(3):
-        for _ in range(RESTING_STATUSES * MAX_REPEAT_REQUESTS):
+        for _ in range(MOST_RESTING_STATUSES):
             bench.send_status(0, state="idle")
         bench.send_status(0, state="jog")
     assert bench.machine.fault == 0

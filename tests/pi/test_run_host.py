@@ -1,4 +1,4 @@
-"""Clients that may command a run, those whose silence ends a row, and the signs of a hanging program."""
+"""Which clients may command a run, whose silence ends a row, and how a hanging program is noticed."""
 
 from __future__ import annotations
 

@@ -30,17 +30,19 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     assert hello.t_unix_ns > 1_600_000_000 * 10**9
     row_finished = host.run_row(1)
     burst = instrument.burst
-    n = instrument.grid.columns
-    assert (row_finished.status, row_finished.points, row_finished.edges, row_finished.bursts) == ("done", n, n, n)
-    assert (row_finished.pulses, row_finished.fault, row_finished.timed_by) == (n * burst.pulses, 0, "one-shot")
+    columns = instrument.grid.columns
+    assert row_finished.status == "done"
+    assert (row_finished.points, row_finished.edges, row_finished.bursts) == (columns, columns, columns)
+    assert row_finished.pulses == columns * burst.pulses
+    assert (row_finished.fault, row_finished.timed_by) == (0, "one-shot")
     assert row_finished.pulses_seen
     events = host.journalled
     assert [e.seq for e in events] == list(range(1, len(events) + 1))
-    assert [type(e) for e in events] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]
+    assert [type(e) for e in events] == [m.RunStarted, m.RowStarted] + columns * [m.Capture] + [m.RowFinished]
     captures = host.list_events(m.Capture)
-    assert [c.point for c in captures] == list(range(n))
+    assert [c.point for c in captures] == list(range(columns))
     # Odd rows run towards -x.
-    assert [c.column for c in captures] == list(reversed(range(n)))
+    assert [c.column for c in captures] == list(reversed(range(columns)))
     for c in captures:
         assert c.last_pulse_ns - c.first_pulse_ns == (burst.pulses - 1) * round(burst.period_us * 1e3)
         assert (c.pulses, c.width_max_ns, c.jitter_ns) == (burst.pulses, round(burst.width_us * 1e3), 0)
@@ -48,7 +50,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     rises = [e.t_ns for e in edges if isinstance(e, WireEdge) and e.value]
     falls = [e.t_ns for e in edges if isinstance(e, WireEdge) and not e.value]
     # Each pulse lasts 1 us.
-    assert {b - a for a, b in zip(rises, falls, strict=True)} == {1000}
+    assert {fall - rise for rise, fall in zip(rises, falls, strict=True)} == {1000}
     assert rises[:: burst.pulses] == [c.first_pulse_ns for c in captures]
     radar.close()
 
@@ -65,16 +67,19 @@ def test_the_stage_gets_its_settings_and_the_row_in_motor_steps(instrument, stag
         pi.host.home()
         stage.stays_after = 2
         pi.host.start_row()
-        # Statuses are published again and again while the stage moves.
-        pi.host.wait_for_event(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
-        pi.host.wait_for_event(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
+        # The same status is published more than once while the row lasts.
+        for _ in range(2):
+            pi.host.wait_for_event(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
         stage.stays_after = None
         pi.host.wait_for_event(m.RowFinished)
     row = next(c for c in stage.seen if c.verb == "ROW")
-    # 200 steps/mm; half of eight columns 2 mm apart, and the first of four rows.
-    half = 3.5 * 2 * 200
-    y = 250 * 200 - 1.5 * 2 * 200
-    assert row.args == (400 * 200 - half, 400, 8, y, 4000)
+    steps_per_mm = 200
+    # The grid has eight columns and four rows, 2 mm apart. Its middle is at x 400 mm and y 250 mm.
+    first_x = (400 - 3.5 * 2) * steps_per_mm
+    first_y = (250 - 1.5 * 2) * steps_per_mm
+    distance = 2 * steps_per_mm
+    rate = 20 * steps_per_mm
+    assert row.args == (first_x, distance, 8, first_y, rate)
     # The units are those of docs/spec/stage-line.md: milliseconds, microseconds, and steps of 1/200 mm.
     settings = {Parameter(c.args[0]): c.args[1] for c in stage.seen if c.verb == "SET"}
     assert settings == {

@@ -116,8 +116,8 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     stage.stays_after = 4
     pi.clock.stands = False
     wait_for(lambda: stop_is_sent(stage), "STOP")
-    number = PiFault.PROGRAM_LATE if host_lives else PiFault.HOST_LOST
-    assert host.wait_for_state("ready").fault == number
+    expected_fault = PiFault.PROGRAM_LATE if host_lives else PiFault.HOST_LOST
+    assert host.wait_for_state("ready").fault == expected_fault
     # An entry for each time that the watchdog is notified.
     notified: list[bool] = []
     monkeypatch.setattr(pi.service.executor, "_turned", lambda: notified.append(True))
@@ -127,7 +127,7 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     # The watchdog is notified only if every part of the program is in time.
     assert not notified
     disk.thaw()
-    assert host.wait_for_event(m.RowFinished).fault == number
+    assert host.wait_for_event(m.RowFinished).fault == expected_fault
     wait_for(lambda: bool(notified), "that the watchdog is notified again")
 
 
@@ -281,7 +281,7 @@ context.term()
 def test_subscribers_that_disconnect_together_delay_no_command(
     start, instrument, hub, request, record_testsuite_property
 ):
-    """libzmq cleans up after them inside the publisher's next send, which then lasts long."""
+    """The publisher's next send then lasts long: libzmq removes the subscribers within it."""
     is_campaign = request.config.getoption("--long")
     program, host = start(instrument, "--wires", hub)
     host.must_accept(host.make_begin(owner=OWNER))

@@ -19,6 +19,8 @@ ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=-2.0, points=50)
 HEARTBEAT_S = 0.5
 # Time at which a watch begins.
 BEGIN_S = 100.0
+# The reader looks at the watch every 50 ms.
+LOOK_S = 0.05
 
 
 def make_watch(interval_s: float = 0.125) -> StatusWatch:
@@ -28,11 +30,11 @@ def make_watch(interval_s: float = 0.125) -> StatusWatch:
 
 
 def look(watch: StatusWatch, begin_s: float, end_s: float) -> float:
-    """Look every 50 ms as the reader does; return the silence at the end, 0 while it is within the timeout."""
+    """Look as the reader does, from `begin_s` to `end_s`; return the silence at the end, 0 within the timeout."""
     silent_s = 0.0
-    steps = round((end_s - begin_s) / 0.05)
+    steps = round((end_s - begin_s) / LOOK_S)
     for step in range(steps + 1):
-        silent_s = watch.silent_s(begin_s + step * 0.05)
+        silent_s = watch.silent_s(begin_s + step * LOOK_S)
     return silent_s
 
 
@@ -56,35 +58,40 @@ def test_a_watch_is_looked_at_twice_for_each_request(heartbeat_s, look_s):
 def test_a_stage_is_silent_when_its_oldest_request_is_not_answered(interval_s, timeout_s):
     watch = make_watch(interval_s)
     assert watch.is_at_rest == (interval_s == 1.0)
-    # Nothing was asked: no silence.
-    assert look(watch, 100.0, 120.0) == 0.0
-    assert watch.is_due(120.0)
-    assert look(watch, 120.05, 120 + timeout_s) == 0.0
+    asked_s = 120.0
+    # Before the first request there is no silence.
+    assert look(watch, BEGIN_S, asked_s) == 0.0
+    assert watch.is_due(asked_s)
+    assert look(watch, asked_s + LOOK_S, asked_s + timeout_s) == 0.0
     # A later request does not begin the time again.
-    assert watch.is_due(120 + timeout_s)
-    assert look(watch, 120.05 + timeout_s, 120.1 + timeout_s) == pytest.approx(timeout_s + 0.1)
+    later_s = asked_s + timeout_s
+    assert watch.is_due(later_s)
+    assert look(watch, later_s + LOOK_S, later_s + 2 * LOOK_S) == pytest.approx(timeout_s + 2 * LOOK_S)
     watch.note_answer()
-    assert watch.silent_s(120.15 + timeout_s) == 0.0
+    assert watch.silent_s(later_s + 3 * LOOK_S) == 0.0
 
 
 def test_time_in_which_the_reader_itself_was_late_does_not_count():
     watch = make_watch()
-    look(watch, 100.0, 100.1)
-    assert watch.is_due(100.125)
-    assert watch.silent_s(100.125) == 0.0
+    look(watch, BEGIN_S, 100.1)
+    asked_s = 100.125
+    assert watch.is_due(asked_s)
+    assert watch.silent_s(asked_s) == 0.0
     # The reader slept for ten seconds. Usually it looks every 50 ms, and is late by no more than that.
-    assert watch.silent_s(110.125) == 0.0
-    # From then on the usual timeout counts, half of a heartbeat.
+    awake_s = 110.125
+    assert watch.silent_s(awake_s) == 0.0
+    # From now on the stage has the usual timeout, half of a heartbeat.
     timeout_s = 0.25
-    assert look(watch, 110.175, 110.025 + timeout_s) == 0.0
-    assert look(watch, 110.075 + timeout_s, 110.125 + timeout_s) == pytest.approx(timeout_s + 0.1)
+    assert look(watch, awake_s + LOOK_S, awake_s - 2 * LOOK_S + timeout_s) == 0.0
+    assert look(watch, awake_s - LOOK_S + timeout_s, awake_s + timeout_s) == pytest.approx(timeout_s + 2 * LOOK_S)
 
 
-def test_another_interval_begins_the_time_again():
+def test_another_interval_of_requests_begins_the_time_again():
     watch = make_watch()
     assert watch.is_due(100.2)
-    watch.ask_every(0.1, 200.0)
-    assert look(watch, 200.0, 200.5) == 0.0
+    new_begin_s = 200.0
+    watch.ask_every(0.1, new_begin_s)
+    assert look(watch, new_begin_s, new_begin_s + HEARTBEAT_S) == 0.0
 
 
 def make_row(**changes: Any) -> RunningRow:

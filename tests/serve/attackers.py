@@ -76,7 +76,7 @@ async def guess_token(port: int, scan: int) -> None:
 
 
 def open_connections(port: int, rate: int, opened: Synchronized[int]) -> None:
-    """Open connections and close them without a request, so many each second; in a process of its own."""
+    """Open `rate` connections a second and close them without a request; this runs in a process of its own."""
     parent = os.getppid()
     begun_s = time.monotonic()
     while os.getppid() == parent:

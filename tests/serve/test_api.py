@@ -183,7 +183,7 @@ def test_one_of_two_simultaneous_starts_is_refused(view, scans, monkeypatch):
 
 
 def test_open_live_views_do_not_prevent_pausing_and_stopping(view, scans):
-    """A command needs no live view: it neither opens one nor closes those of other pages, of which no more may open."""
+    """A command needs no live view, so that it is accepted although no further live view may be opened."""
     for k in range(site.MAX_WATCHES):
         (scans / f"view{k}" / "program").mkdir(parents=True)
     with ExitStack() as pages, open_control(scans / "one") as stop:

@@ -210,7 +210,7 @@ def test_too_many_connections_close_silent_ones_and_none_with_unread_bytes():
     """A request that was sent is read, even if the connection is closed afterwards."""
 
     class Connection:
-        """Replaces a connection of the server and its transport, as far as the limit uses them."""
+        """Replaces a connection of the server, and also its transport, with the members that the limit uses."""
 
         def __init__(self, unread: bool) -> None:
             self.unread = unread
@@ -368,10 +368,10 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans
 
         def send(part: list[bytes]) -> None:
             for data in part:
-                s = socket.create_connection(("127.0.0.1", view.port), HANG_S)
-                s.sendall(data)
+                attacker = socket.create_connection(("127.0.0.1", view.port), HANG_S)
+                attacker.sendall(data)
                 # The connection is left open, and its answer is not read.
-                open_sockets.append(s)
+                open_sockets.append(attacker)
 
         # Eight attackers share the requests; meanwhile the operator reads and opens sessions.
         threads = [threading.Thread(target=send, args=(requests[k::8],)) for k in range(8)]
@@ -381,8 +381,8 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans
             assert get(view, "/api/scans")["scans"]
             assert post(view, "/api/session")[0] == 200
             time.sleep(0.01)
-        for s in open_sockets:
-            s.close()
+        for attacker in open_sockets:
+            attacker.close()
         assert compute_digest(tmp_path) == digest_before
         assert post(view, "/api/notes?scan=one", {"notes": "the operator's", "tags": ["a"]})[0] == 200
         assert get(view, "/api/scan?scan=one")["notes"] == "the operator's"

@@ -29,7 +29,7 @@ from polysight.results import WARNING_SIGMAS
 from polysight.serve import programs, reading
 from polysight.serve.site import HIDDEN
 from polysight_shared.config import CheckPlate
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ScanError
 from polysight_shared.findings import Finding
 
 # Condition for each page to be complete. Cards of the list have no text before they are painted (`content-visibility`
@@ -495,7 +495,7 @@ def test_a_scan_that_was_stopped_on_request_has_not_failed(page, scans):
     folder = scans / "one" / PROGRAM_FOLDER
     folder.mkdir()
     (folder / "scan.json").write_bytes(msgspec.json.encode(record))
-    (folder / "scan.status").write_text("6\n", encoding="utf-8")
+    (folder / "scan.status").write_text(f"{ScanError.exit_status}\n", encoding="utf-8")
     for end, shown_text in (
         ("stopped on request, 2 of 3 rows are missing", "was stopped on request"),
         ("", "has failed"),

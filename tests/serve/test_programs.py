@@ -7,6 +7,7 @@ KIND.log (its output) and KIND.status (its exit status).
 import json
 import os
 import shutil
+import signal
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,7 +27,7 @@ from polysight.jobs.live_scan import _check_new
 from polysight.serve.programs import Programs
 from polysight.store import validate
 from polysight_shared import messages as m
-from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.tables import to_builtins
 
@@ -55,11 +56,11 @@ def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     assert program.words == ("polysight", "--version")
     assert program.log.split()[0] == "polysight"
 
-    # The folder is not a scan, so that the second program fails: 3 is the status of wrong data.
+    # The folder is not a scan, so that the second program fails.
     programs.start(tmp_path, "export", ["validate", tmp_path])
     wait_for(lambda: find_program(tmp_path, "export").status is not None, "its status")
     program = find_program(tmp_path, "export")
-    assert program.status == 3
+    assert program.status == DataError.exit_status
     assert "why:" in program.log
     # The output of the first program stays in the file, but is not shown.
     assert "--version" not in program.log
@@ -72,7 +73,7 @@ def sleeping(programs: Programs, tmp_path: Path) -> Iterator[Path]:
     try:
         yield tmp_path
     finally:
-        os.killpg(pid, 9)
+        os.killpg(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
     # A program that is killed leaves no exit status.
     assert find_program(tmp_path, "scan").status is None
@@ -104,7 +105,7 @@ def test_an_invented_process_number_is_not_a_running_program(tmp_path, content):
 
 
 def test_a_log_is_shown_without_control_characters(tmp_path):
-    """Colours, the bell, and U+202E, which reverses text, are left out; a byte that is not UTF-8 becomes U+FFFD."""
+    """A log has no colours, no bell, and no U+202E, which reverses text. Bytes that are not UTF-8 become U+FFFD."""
     (tmp_path / PROGRAM_FOLDER).mkdir()
     answer = {"pid": 0, "ticks": 0, "words": ["x"], "started_utc": ""}
     (tmp_path / PROGRAM_FOLDER / "scan.json").write_text(json.dumps(answer))
@@ -147,16 +148,12 @@ def test_a_scan_starts_with_its_plan_and_a_refusal_by_the_pi_has_its_cause(refus
     root = tmp_path / "scans"
     root.mkdir()
     with serve_folder(root, TOKEN, config=config) as view:
-        refused_requests = [
-            {"name": "a"} | wrong_plan
-            for wrong_plan in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"})
-        ]
-        for body, status in [
-            ({"name": "../out"}, 404),
-            ({"name": ".hidden"}, 404),
-            *((body, 400) for body in refused_requests),
-        ]:
-            assert post(view, "/api/start", body)[0] == status, body
+        for name in ("../out", ".hidden"):
+            status, _ = post(view, "/api/start", {"name": name})
+            assert status == 404, name
+        for wrong_part in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"}):
+            status, _ = post(view, "/api/start", {"name": "a", **wrong_part})
+            assert status == 400, wrong_part
         assert [p.name for p in root.iterdir()] == []
 
         request = {"name": "week/one", "plan": {"rows": 3}, "notes": "n", "tags": ["t"]}

@@ -83,7 +83,7 @@ def test_the_name_of_a_host_is_read_without_its_port(host, name):
 @pytest.mark.parametrize(
     ("method", "path", "access", "headers", "status"),
     [
-        # Programs of this machine read without the token, those of others with it.
+        # Programs of this machine read without the token, programs of other machines need it.
         ("GET", "/api/scans", LOCAL, {}, 200),
         ("GET", "/api/scans", REMOTE, {}, 401),
         ("GET", "/api/scans", REMOTE, {"x_polysight_token": TOKEN}, 200),
@@ -150,7 +150,8 @@ def test_a_body_has_at_most_64_kilobytes(length, status):
     body = b"x" * length
     answered, received_body = ask(LOCAL, "POST", "/api/stop", body, x_polysight_token=TOKEN)
     assert answered == status
-    assert received_body == (body if status == 200 else b"")
+    expected_body = body if status == 200 else b""
+    assert received_body == expected_body
 
 
 @pytest.mark.parametrize(("length", "status"), [("65536", 200), ("65537", 413), ("9" * 5000, 200)])

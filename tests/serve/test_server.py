@@ -110,7 +110,7 @@ def test_the_page_loads_nothing_from_other_servers():
 
 
 def has_rows(rows):
-    """Function that is true of a state whose pictures have so many rows."""
+    """Function that is true of a state whose pictures have this number of rows."""
 
     def has_these_rows(state):
         pictures = state.get("pictures")
@@ -195,7 +195,7 @@ def test_connections_wait_in_the_longest_queue_that_the_system_allows():
 
 
 def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
-    """Return the rows of modules, True for dark, as a terminal shows them whose own text is black or white.
+    """Return the rows of modules, True for dark, of a code on a terminal whose own text is black or white.
 
     A character shows two modules, one above the other, by half blocks of Unicode.
     """

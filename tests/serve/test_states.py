@@ -26,10 +26,10 @@ from polysight.serve.guard import Access
 from polysight.serve.programs import Programs
 from polysight.serve.site import Site, Watches
 
-# States of the table without the facts of a scan, and those that only the page itself finds out.
+# States of the table in which the facts of the scan are not known, and states that only the page itself finds out.
 WITHOUT_SCAN = ("empty", "starting", "start_failed", "unreadable", "folder_gone")
 OF_THE_PAGE = ("offline", "server_frozen")
-# Values for the places of the table's texts.
+# Values for the names in braces of the table's texts.
 WORDS: dict[str, Any] = {
     "folder": "scans/one", "safe": "1 of 3 rows are safe.", "asker": "the page", "row": 1, "take": 2,
     "what": "RV: no data.", "why": "The cable is out", "do": "Put it in", "now": "Row 1 is being scanned.",

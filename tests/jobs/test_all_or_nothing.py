@@ -1,6 +1,6 @@
-"""Files of a command are written completely or not at all, after a full disk, a kill or a power cut at any point.
+"""A command writes its files completely or not at all, even if the disk is full, it is killed, or power is lost.
 
-Every operation on the disk fails once. Then the command is repeated, and succeeds.
+Each operation on the disk fails in one of the runs. After each such run the command is repeated, and succeeds.
 """
 
 import shutil

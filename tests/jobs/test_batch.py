@@ -61,7 +61,7 @@ KILLS_ITS_WORKER = """
 
 @pytest.fixture
 def worker(tmp_path, monkeypatch):
-    """Use WORKER as the program that processes a scan."""
+    """WORKER is the program that processes a scan."""
     file = tmp_path / "worker.py"
     file.write_text(WORKER)
     monkeypatch.setattr(batch, "WORKER_COMMAND", (sys.executable, str(file)))
@@ -332,7 +332,7 @@ def test_the_program_of_a_killed_worker_ends_with_it(tmp_path):
     finally:
         starter.kill()
         starter.wait()
-    # It has ended, or is a zombie that no process has waited for.
+    # The child has ended, or is a zombie (Z) that no process has waited for.
     while child.exists() and "State:\tZ" not in (child / "status").read_text():
         time.sleep(0.1)
 

@@ -178,7 +178,7 @@ def test_a_file_with_the_names_of_the_classifier_does_not_count_as_labels(produc
 
 
 def test_boxes_that_another_command_saved_meanwhile_are_not_overwritten(products, monkeypatch):
-    """Otherwise each command would report that its box is saved, and one of them would be lost."""
+    """Otherwise both commands would report that their box is saved, although one box would be lost."""
 
     def edit_during_another_command(*args):
         monkeypatch.undo()

@@ -123,7 +123,7 @@ def test_compare_says_where_its_picture_is(root, capsys, tmp_path):
 
 @pytest.mark.parametrize("folder", ["", "empty"])
 def test_notes_of_a_folder_that_is_not_a_scan_are_refused(root, folder):
-    """Otherwise they would be written, and no list would show them."""
+    """Notes in such a folder would not be shown by any list."""
     (root / "empty").mkdir()
     args = build_parser().parse_args(["note", str(root / folder), "--text", "oak"])
     with expect_refusal(ErrorCode.FILE_MISSING, root / folder):

@@ -1,4 +1,4 @@
-"""Small scans, and watches of them."""
+"""Fixtures: small scans, and watches, which follow a scan for the live view."""
 
 from tests.support.page.fixtures import finished_scan, growing, samples, watching
 

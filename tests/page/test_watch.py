@@ -33,7 +33,7 @@ def read_state(watch: Watch) -> dict:
 
 
 def has_rows(rows: int):
-    """Function that is true of a state whose pictures have so many rows."""
+    """Function that is true of a state whose pictures have this number of rows."""
 
     def has_these_rows(state: dict) -> bool:
         pictures = state.get("pictures")

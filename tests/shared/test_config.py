@@ -45,7 +45,7 @@ def test_no_section_of_the_rig_can_be_changed(rig: Instrument):
 
 
 def test_the_rig_file_has_the_published_chirp_and_burst(rig: Instrument):
-    # The relative limits are those of the digits that the paper gives.
+    # The relative limits follow from the number of digits in the paper.
     assert rig.chirp.swept_hz == pytest.approx(4.622e9, rel=1e-4)
     assert rig.chirp.first_sample_hz == pytest.approx(76.282e9, rel=1e-5)
     # A burst of 16 frames of 4 KiB.
@@ -85,7 +85,7 @@ def test_a_mount_step_is_a_whole_shift_or_a_whole_turn(step):
 def test_a_mount_turns_right_handed_about_each_axis(axis: str, first: int, second: int):
     """A turn about x moves y towards z and z away from y, and so on for the other axes. It is by 30 degrees here."""
     mount = (MountStep(turn_deg=30.0, about=axis),)
-    # Points 1 m along each axis; positions on a board are in mm, those in the rig in m.
+    # Points 1 m along each axis. Positions on a board are in millimetres, positions in the rig in metres.
     points_mm = 1000.0 * np.eye(3)
     images_m = [geometry.transform_to_rig(tuple(point_mm), mount) for point_mm in points_mm]
     cosine = math.cos(math.radians(30.0))

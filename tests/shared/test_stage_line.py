@@ -96,7 +96,7 @@ def test_a_command_outside_the_protocols_ranges_is_not_sent(command: Command):
 
 
 def test_a_line_has_at_most_96_bytes():
-    """Six of them are the star, the four digits of the checksum and the end of the line."""
+    """The star, the four digits of the checksum and the end of the line are six of these bytes."""
     longest = "x" * (96 - 6)
     assert unseal(seal(longest)) == longest
     with pytest.raises(ProtocolError, match="longer"):

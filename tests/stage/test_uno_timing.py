@@ -43,7 +43,7 @@ IDE_COMPILERS = (".arduino15/packages/arduino/tools/avr-gcc/*/bin", "arduino-*/h
 
 
 def list_other_compilers() -> list[Path]:
-    """Folders with an avr-gcc of the Arduino IDE, and those that POLYSIGHT_AVR_GCC lists, separated by colons."""
+    """Folders with an avr-gcc: of the Arduino IDE, and from POLYSIGHT_AVR_GCC, which separates folders by colons."""
     named = [Path(p) for p in os.environ.get("POLYSIGHT_AVR_GCC", "").split(":") if p]
     return named + [compiler for pattern in IDE_COMPILERS for compiler in sorted(Path.home().glob(pattern))]
 

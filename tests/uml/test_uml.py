@@ -132,9 +132,11 @@ def test_virtual_time_repeats_itself(run_row):
 
     libzmq decides by the processor's cycle counter (rdtsc), which is real, whether it reads the guest's clock.
     """
-    bursts = read_bursts(run_row(12, "time-travel=inf-cpu"))
-    second_run = read_bursts(run_row(12, "time-travel=inf-cpu"))
-    assert len(bursts) == len(second_run) == 12
+    points = 12
+    bursts = read_bursts(run_row(points, "time-travel=inf-cpu"))
+    second_run = read_bursts(run_row(points, "time-travel=inf-cpu"))
+    assert len(bursts) == points
+    assert len(second_run) == points
     for (capture, pulses), (capture_again, pulses_again) in zip(bursts, second_run, strict=True):
         assert measure_from_first_rise(pulses) == measure_from_first_rise(pulses_again)
         edge_shift_ns = capture_again.edge_ns - capture.edge_ns

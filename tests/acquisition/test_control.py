@@ -14,7 +14,7 @@ from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 from tests.support.store.small_scan import SmallScan
 
-from polysight.acquisition import control as control_module, scan as host_run
+from polysight.acquisition import control as control_module
 from polysight.acquisition.control import (
     ALIVE_FILE,
     CONTROL_FOLDER,
@@ -26,6 +26,7 @@ from polysight.acquisition.control import (
     read_start_ticks,
     send_command,
 )
+from polysight.acquisition.scan import run_scan
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.errors import ErrorCode
@@ -93,12 +94,18 @@ def test_the_status_of_a_scan_names_its_host_and_requests_and_ends_with_it(tmp_p
         control.open()
         wait_for(lambda: read_life(tmp_path), "the first sign of life")
         life = read_life(tmp_path)
-        assert (life.pid, life.ticks, life.killed) == (os.getpid(), read_start_ticks(os.getpid()), False)
-        assert (life.doing, life.asked, life.asker) == ("rows", "", "")
+        assert life.pid == os.getpid()
+        assert life.ticks == read_start_ticks(os.getpid())
+        assert not life.killed
+        assert life.doing == "rows"
+        assert life.asked == ""
+        assert life.asker == ""
         wait_for(lambda: read_life(tmp_path).written_s != life.written_s, "the next sign of life")
         send_command(tmp_path, ScanCommand.STOP, "the page at 192.168.1.7")
         wait_for(lambda: read_life(tmp_path).asked, "what was asked")
-        assert (read_life(tmp_path).asked, read_life(tmp_path).asker) == ("stop", "the page at 192.168.1.7")
+        life = read_life(tmp_path)
+        assert life.asked == "stop"
+        assert life.asker == "the page at 192.168.1.7"
         control.end_rows()
         wait_for(lambda: read_life(tmp_path).doing == "materials", "that rows have ended")
         with expect_refusal(ErrorCode.NO_ANSWER, "materials"):
@@ -109,15 +116,24 @@ def test_the_status_of_a_scan_names_its_host_and_requests_and_ends_with_it(tmp_p
 
 def test_after_the_rows_no_command_is_obeyed(tmp_path):
     stop = StopRequest()
+
+    def has_ended_rows() -> bool:
+        life = read_life(tmp_path)
+        return life is not None and life.doing == "materials"
+
+    def reports_a_request() -> bool:
+        life = read_life(tmp_path)
+        return life is not None and life.asked != ""
+
     with ControlFolder(tmp_path, stop) as control:
         control.open()
         wait_for((tmp_path / CONTROL_FOLDER / ALIVE_FILE).exists, "the first sign of life")
         control.end_rows()
-        wait_for(lambda: (life := read_life(tmp_path)) is not None and life.doing == "materials", "the end of the rows")
+        wait_for(has_ended_rows, "the end of the rows")
         (tmp_path / CONTROL_FOLDER / "pause").touch()
         # Commands are read before each sign of life.
         stop.request("a signal")
-        wait_for(lambda: (life := read_life(tmp_path)) is not None and life.asked != "", "a sign of life after it")
+        wait_for(reports_a_request, "a sign of life after the command")
         assert not stop.paused
         assert (tmp_path / CONTROL_FOLDER / "pause").exists()
 
@@ -200,6 +216,12 @@ def load_fact_contents(path: Path) -> list[str]:
     return [f["fact"] for f in load_facts(path)]
 
 
+def load_boards_of_rows(path: Path) -> dict:
+    """Return what was committed of each board, by row."""
+    rows = ScanFolder.load(path).committed_rows()
+    return {number: row.boards for number, row in rows.items()}
+
+
 def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
     """Run a scan with this stop request; call `at_row_1` when row 0 is committed."""
     scan = SmallScan(samples, folder)
@@ -209,7 +231,7 @@ def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
             at_row_1()
 
     with scan._connect_pi():
-        host_run.run_scan(samples.instrument, scan.path, stop=stop, progress=call_at_row_1)
+        run_scan(samples.instrument, scan.path, stop=stop, progress=call_at_row_1)
     return scan
 
 
@@ -226,18 +248,19 @@ def call_when_paused(folder: Path, act: Callable[[], None]) -> None:
 def test_a_paused_scan_waits_between_rows_and_then_records_the_others(samples, finished_scan, tmp_path):
     stop = StopRequest()
 
+    def go_on() -> None:
+        stop.paused = False
+
     def pause() -> None:
         stop.paused = True
-        call_when_paused(tmp_path / "scan", lambda: setattr(stop, "paused", False))
+        call_when_paused(tmp_path / "scan", go_on)
 
     scan = scan_with(samples, tmp_path, stop, pause)
     facts = [f for f in load_fact_contents(scan.path) if f != "radars"]
     assert facts[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
     assert facts[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
-    rows = ScanFolder.load(scan.path).committed_rows()
-    rows_without_pause = ScanFolder.load(finished_scan).committed_rows()
-    assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in rows_without_pause.items()}
+    assert load_boards_of_rows(scan.path) == load_boards_of_rows(finished_scan)
 
 
 def test_a_paused_scan_can_be_stopped(samples, tmp_path):

@@ -14,6 +14,8 @@ from polysight.capture.row_files import read_index
 
 POINTS = 8
 PULSES = 6
+# Number of the last pulse of a row; they count from 0.
+LAST_PULSE = POINTS * PULSES - 1
 
 
 @pytest.fixture
@@ -29,7 +31,8 @@ def timed_rig(make_instrument, monkeypatch, request):
 
     def receive_in_time(event, _):
         # Events arrive a millisecond after the last pulse.
-        return ReceivedCapture(event, event.last_pulse_ns - PI_AHEAD_NS + 1_000_000)
+        last_pulse_ns = event.last_pulse_ns - PI_AHEAD_NS
+        return ReceivedCapture(event, last_pulse_ns + 1_000_000)
 
     def read_timed_index(path):
         facts, arrivals = read_index(path)
@@ -53,11 +56,14 @@ def check_unmasked(result, payload, name: str) -> np.ndarray:
 
 @pytest.mark.parametrize("timed_rig", [3], indirect=True)
 def test_a_row_with_missed_pulses_is_retaken(timed_rig, payload, tmp_path):
-    for take in range(1, 4):
-        timed_rig.cards["RH"].missed[0, take] = {20}
-        timed_rig.cards["RV"].missed[0, take] = {0, 47}
+    row = 0
+    takes_with_missed_pulses = (1, 2, 3)
+    for take in takes_with_missed_pulses:
+        timed_rig.cards["RH"].missed[row, take] = {20}
+        timed_rig.cards["RV"].missed[row, take] = {0, LAST_PULSE}
     result = run_scan(timed_rig.instrument, tmp_path / "s")
-    assert (result.exit_status, result.retakes) == ("success", 3)
+    assert result.exit_status == "success"
+    assert result.retakes == len(takes_with_missed_pulses)
     for fact in load_facts(result.folder, "row_rejected"):
         assert fact["row"] == 0
         assert [fault["kind"] for fault in fact["faults"]] == ["pulses_missed"] * 2
@@ -67,12 +73,14 @@ def test_a_row_with_missed_pulses_is_retaken(timed_rig, payload, tmp_path):
 
 
 def test_an_incomplete_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(timed_rig, payload, tmp_path):
-    missed = {"RH": {20}, "RV": {0, 30, 31, 47}}
+    row = 0
+    missed = {"RH": {20}, "RV": {0, 30, 31, LAST_PULSE}}
     for name, pulses in missed.items():
         for take in (1, 2):
-            timed_rig.cards[name].missed[0, take] = pulses
+            timed_rig.cards[name].missed[row, take] = pulses
     result = run_scan(timed_rig.instrument, tmp_path / "s", keep_incomplete=True)
-    assert (result.exit_status, result.incomplete_rows) == ("success", [0])
+    assert result.exit_status == "success"
+    assert result.incomplete_rows == [row]
     assert list_errors(result.folder.path) == []
     for name, pulses in missed.items():
         assert check_unmasked(result, payload, name)[sorted(pulses)].all()
@@ -80,10 +88,13 @@ def test_an_incomplete_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(ti
 
 
 def test_a_card_is_reset_after_a_row_whose_frames_came_at_other_times(timed_rig, tmp_path):
-    """A spurious edge and as many lost packets at the end leave the length right: the next start is one frame off."""
-    timed_rig.cards["RH"].extra[0, 1] = 20
+    """A spurious edge starts a frame before pulse 20, and the last pulse gets none: the record's length is right."""
+    row = 0
+    take = 1
+    timed_rig.cards["RH"].extra[row, take] = 20
     result = run_scan(timed_rig.instrument, tmp_path / "s")
-    assert (result.exit_status, result.retakes) == ("success", 1)
+    assert result.exit_status == "success"
+    assert result.retakes == 1
     # Each card is reset at the start, and RH once more before the retake.
     resets = {name: card.codes_received.count(Code.RESET_FPGA) for name, card in timed_rig.cards.items()}
     assert resets == {"RH": 2, "RV": 1}

@@ -12,7 +12,7 @@ from tests.support.page.live_view import add_fact, begin_history
 from tests.support.rigs import load_published_rig
 from tests.support.store.facts import load_facts
 
-from polysight.acquisition import scan as running
+from polysight.acquisition import scan
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.progress import ScanProgress, time_left, typical_row_s
 from polysight.acquisition.row import row_limit_s
@@ -33,9 +33,9 @@ def test_time_left_is_rows_times_their_time_minus_elapsed_time():
     assert time_left(0, ROW_S, 5.0) == 0
     for elapsed in (0.0, 1.0, ROW_S):
         assert time_left(10, ROW_S, elapsed) == 10 * ROW_S - elapsed
-    # A row that lasts longer than expected is taken to end now; the others still take their time.
+    # A row that lasts longer than expected is assumed to end now; the others still need their time.
     assert time_left(10, ROW_S, 1e6) == 9 * ROW_S
-    # A clock that was set back does not lengthen it.
+    # A clock that was set back does not lengthen the time left.
     assert time_left(10, ROW_S, -3.0) == 10 * ROW_S
 
 
@@ -49,10 +49,11 @@ def test_one_long_row_does_not_change_the_typical_row_time():
 def test_the_time_limit_of_a_row_is_a_minute_and_four_times_its_travel():
     rig = load_published_rig()
     stage = msgspec.structs.replace(rig.stage, travel_speed_mm_s=50.0, speed_mm_s=5.0)
-    travel_s = (stage.travel_x_mm + stage.travel_y_mm) / 50
+    travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
     row = Row(index=0, y_mm=0.0, x_start_mm=40.0, step_mm=-2.0, points=50)
+    row_s = 50 * 2.0 / 5.0
     limit_s = row_limit_s(msgspec.structs.replace(rig, stage=stage), row)
-    assert limit_s == 60 + 4 * (travel_s + 2 * 50 / 5)
+    assert limit_s == 60 + 4 * (travel_s + row_s)
 
 
 class Clock:
@@ -71,12 +72,12 @@ class Clock:
 
 
 def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
-    """Rows of 12 s, the first after homing, the third after a pause of two hours."""
+    """Rows of `ROW_S`, the first after homing, the third after a pause of two hours."""
     stop = StopRequest()
     # Time left, with the number of committed rows or the message of a pause.
     reported = []
     clock = Clock(stop)
-    monkeypatch.setattr(running, "time", clock)
+    monkeypatch.setattr(scan, "time", clock)
 
     def progress(p) -> None:
         if p.phase == "home":

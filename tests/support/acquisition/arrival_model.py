@@ -16,7 +16,7 @@ S = 1_000_000_000
 PAYLOAD = 1456
 # Time in which the radar sends a frame's bytes to the card
 FRAME_NS = 128 * US
-# A card waits so long before it sends a packet that is not full.
+# Time that a card waits before it sends a packet that is not full
 LAST_PACKET_DELAY_NS = 2 * S
 # Least time between two packets of a card
 PACKET_INTERVAL_NS = 25 * US
@@ -83,7 +83,7 @@ def receive(
     arrivals: list[tuple[float, int]] = []
     sent_ns = 0.0
     for k, stop in enumerate([*range(PAYLOAD, row_bytes, PAYLOAD), row_bytes]):
-        # The packet is full when its last byte has come from the radar, in this frame after so many of its bytes.
+        # The packet is full when its last byte has come from the radar: it is byte `bytes_of_frame` of `frame`.
         frame = (stop - 1) // frame_bytes
         bytes_of_frame = stop - frame * frame_bytes
         full_ns = edges_ns[frame] + FRAME_NS * bytes_of_frame / frame_bytes

@@ -81,7 +81,7 @@ class FakePi:
         self._ran: set[tuple[int, int]] = set()
         self.hanging: tuple[Row, int] | None = None
         self.context = zmq.Context()
-        # Unlike REP it may leave a request without a reply
+        # Unlike a REP socket, a ROUTER socket may leave a request without a reply.
         self.rep = self.context.socket(zmq.ROUTER)
         self.rep.bind(rig.pi.command_address)
         self.pub = self.context.socket(zmq.PUB)
@@ -135,32 +135,32 @@ class FakePi:
             return
         self.pub.send_multipart([b"event", m.pack(event)])
 
-    def _answer(self, c: m.AnyCommand) -> m.AnyReply:
+    def _answer(self, command: m.AnyCommand) -> m.AnyReply:
         """Return the reply to a command; a row that it starts is left to `_finish_command`."""
         self._todo = None
         scan = self._scan_id()
         last = len(self.journal.get(scan, []))
-        if isinstance(c, m.Hello):
+        if isinstance(command, m.Hello):
             return m.HelloReply(
                 pi_release="t", firmware="t", backend="fake", state=self.state, scan_id=scan, last_seq=last,
                 stage=self.placement_settings,
             )  # fmt: skip
-        if isinstance(c, m.Status):
+        if isinstance(command, m.Status):
             return m.StatusReply(
                 state=self.state, homed=self.homed, x_mm=0, y_mm=0, scan_id=scan, row_index=-1, take=0, points=0,
                 pulses=0, last_seq=last, fault=self.fault, reason=self.latched_reason, lost_x_mm=self.lost_steps_mm[0],
                 lost_y_mm=self.lost_steps_mm[1],
             )  # fmt: skip
-        if isinstance(c, m.EndRun) and (self.hanging is not None or self.run is None):
+        if isinstance(command, m.EndRun) and (self.hanging is not None or self.run is None):
             problem = "a row is running" if self.run else "no run is begun"
             return m.Refused(number=PiFault.NOT_READY, problem=problem)
-        if isinstance(c, m.BeginRun):
-            self.run = c
+        if isinstance(command, m.BeginRun):
+            self.run = command
             self._ran = set()
-            self._emit(m.RunStarted, plan=c.plan, resumed=bool(self.journal.get(c.scan_id)))
-        elif isinstance(c, m.EndRun):
-            self._emit(m.RunStopped, exit_status=c.exit_status, reason=c.reason)
-        elif isinstance(c, m.Home):
+            self._emit(m.RunStarted, plan=command.plan, resumed=bool(self.journal.get(command.scan_id)))
+        elif isinstance(command, m.EndRun):
+            self._emit(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
+        elif isinstance(command, m.Home):
             self.homed = True
             self.state = "ready"
             self.fault = 0
@@ -171,59 +171,60 @@ class FakePi:
                 self.state = "fault"
                 self.fault = PiFault.STAGE_ALARM
                 self.latched_reason = "the switch was not found"
-        elif isinstance(c, m.Replay):
-            events = self.journal.get(c.scan_id, [])
+        elif isinstance(command, m.Replay):
+            events = self.journal.get(command.scan_id, [])
             # Sequence numbers count from 1.
-            first = c.from_seq - 1
-            count = min(c.limit, MAX_REPLAYED_EVENTS)
+            first = command.from_seq - 1
+            count = min(command.limit, MAX_REPLAYED_EVENTS)
             return m.ReplayReply(events=events[first : first + count], last_seq=len(events))
-        elif isinstance(c, m.RunRow):
+        elif isinstance(command, m.RunRow):
             # A repeated request runs no row again.
-            if (c.row_index, c.take) not in self._ran:
-                self._ran.add((c.row_index, c.take))
-                self.rows_run.append((c.row_index, c.take))
-                self._todo = c
-        elif isinstance(c, m.Abort) and self.hanging is not None:
+            if (command.row_index, command.take) not in self._ran:
+                self._ran.add((command.row_index, command.take))
+                self.rows_run.append((command.row_index, command.take))
+                self._todo = command
+        elif isinstance(command, m.Abort) and self.hanging is not None:
             row, take = self.hanging
             self.hanging = None
             self._emit(
                 m.RowFinished, row_index=row.index, take=take, status="aborted", points=0, edges=0, bursts=0, pulses=0,
-                fault=PiFault.ABORTED, reason=c.reason,
+                fault=PiFault.ABORTED, reason=command.reason,
             )  # fmt: skip
         return m.Accepted(state=self.state)
 
     def _finish_command(self) -> None:
         """Run the row that the last command has started: its events, and the data of all cards."""
-        c = self._todo
-        if c is None or self.run is None:
+        command = self._todo
+        if command is None or self.run is None:
             return
-        row = self.run.plan.row(c.row_index)
-        self._emit(m.RowStarted, row=row, take=c.take)
-        if c.row_index in self.hang_at:
+        row = self.run.plan.row(command.row_index)
+        self._emit(m.RowStarted, row=row, take=command.take)
+        if command.row_index in self.hang_at:
             if self.hang_held:
                 self.state = "held"
-            self.hanging = (row, c.take)
+            self.hanging = (row, command.take)
             for card in self.cards:
-                card.missing_end_bytes[row.index, c.take] = card.row_bytes // 2
-                card.send_row(row.index, c.take)
+                card.missing_end_bytes[row.index, command.take] = card.row_bytes // 2
+                card.send_row(row.index, command.take)
             if self.hang_after_captures:
-                self._send_captures(row, c.take)
+                self._send_captures(row, command.take)
             return
         if self.send_frame_by_frame:
-            self._send_frames(row, c.take)
+            self._send_frames(row, command.take)
         else:
-            self._send_captures(row, c.take)
+            self._send_captures(row, command.take)
             for card in self.cards:
-                card.send_row(row.index, c.take)
-        fault = self.fail_rows.get((c.row_index, c.take), 0)
+                card.send_row(row.index, command.take)
+        fault = self.fail_rows.get((command.row_index, command.take), 0)
         if fault in STAGE_FAULTS or fault in FAULTS_AT_A_KNOWN_POSITION:
             self.fault = fault
             self.state = "fault"
             self.homed = fault in FAULTS_AT_A_KNOWN_POSITION
         n = row.points
+        note = self.notes.get((command.row_index, command.take), "")
         self._emit(
-            m.RowFinished, row_index=row.index, take=c.take, status="fault" if fault else "done", points=n, edges=n,
-            bursts=n, pulses=n * self.run.pulses, fault=fault, reason=self.notes.get((c.row_index, c.take), ""),
+            m.RowFinished, row_index=row.index, take=command.take, status="fault" if fault else "done", points=n,
+            edges=n, bursts=n, pulses=n * self.run.pulses, fault=fault, reason=note,
         )  # fmt: skip
 
     def _send_captures(self, row: Row, take: int) -> None:

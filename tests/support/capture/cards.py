@@ -53,7 +53,12 @@ class Cards:
     def power_cycle(self, name: str) -> None:
         """Switch a card off and on; returns when it is done."""
         done = threading.Event()
-        self._tasks.append(lambda: (self.endpoints[name].power_cycle(), done.set()))
+
+        def switch_off_and_on() -> None:
+            self.endpoints[name].power_cycle()
+            done.set()
+
+        self._tasks.append(switch_off_and_on)
         assert done.wait(HANG_S)
 
     def _serve(self) -> None:

@@ -75,8 +75,8 @@ class Card:
                 self.reset()
             payload = full_record.data[k * FULL : (k + 1) * FULL]
             packets.append(encode_packet(self._sequence, self._count, payload))
-            self._sequence = self._sequence + 1
-            self._count = self._count + len(payload)
+            self._sequence += 1
+            self._count += len(payload)
         return Record(full_record.data, packets)
 
 

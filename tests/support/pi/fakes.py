@@ -185,20 +185,27 @@ class FakeStage:
         self.banner = True
         self.deaf = False
         self.steps = "200"
-        self.lose = self.damage = self.lose_end = 0
+        self.lose = 0
+        self.damage = 0
+        self.lose_end = 0
         self.skip: set[int] = set()
         self.stays_after: int | None = None
         self.lost = (0, 0)
         self.alarm_at: dict[int, int] = {}
         self.pace_s = 0.0
-        self.homed = self.moving = self.held = False
+        self.homed = False
+        self.moving = False
+        self.held = False
         self.alarm = 0
-        self.x = self.y = self.points = 0
+        self.x = 0
+        self.y = 0
+        self.points = 0
         self.t_ns = 1_000_000_000
         self.seen: list[Command] = []
         self.bytes_seen: list[int] = []
         self.rows_run = 0
         self.row_end: tuple[int, int] | None = None
+        # The last command's number with the answer to it, and with the report of its motion's end
         self._last: tuple[int, Reply] | None = None
         self._end: tuple[int, Reply] | None = None
         self._stopping = threading.Event()
@@ -229,6 +236,7 @@ class FakeStage:
         raw = reply.encode()
         if self.damage and reply.kind in ("ok", "error"):
             self.damage -= 1
+            # One bit of the fourth byte is wrong.
             raw = raw[:3] + bytes([raw[3] ^ 1]) + raw[4:]
         self.say_raw(raw)
 
@@ -258,19 +266,19 @@ class FakeStage:
                 continue
             if not events & select.POLLIN:
                 continue
-            for c in os.read(self.master, 4096):
-                if c >= FIRST_IMMEDIATE_BYTE:
-                    self._immediate(c)
-                elif c == ord("\n"):
+            for byte in os.read(self.master, 4096):
+                if byte >= FIRST_IMMEDIATE_BYTE:
+                    self._immediate(byte)
+                elif byte == ord("\n"):
                     self._line(buffer + b"\n")
                     buffer = b""
                 else:
-                    buffer += bytes([c])
+                    buffer += bytes([byte])
 
-    def _immediate(self, c: int) -> None:
+    def _immediate(self, byte: int) -> None:
         """Execute an immediate byte."""
-        self.bytes_seen.append(c)
-        if c == Immediate.STATUS:
+        self.bytes_seen.append(byte)
+        if byte == Immediate.STATUS:
             if self.held:
                 state = "hold"
             elif self.moving:
@@ -281,71 +289,76 @@ class FakeStage:
                 state = "idle"
             fields = {"state": state, "x": self.x, "y": self.y, "points": self.points, "pulses": self.points}
             self.say(Reply("status", fields={k: str(v) for k, v in fields.items()} | {"alarm": str(self.alarm)}))
-        elif c == Immediate.HOLD:
+        elif byte == Immediate.HOLD:
             self.held = True
-        elif c == Immediate.RESUME:
+        elif byte == Immediate.RESUME:
             self.held = False
-        elif c == Immediate.STOP:
+        elif byte == Immediate.STOP:
             self._stopping.set()
 
     def _line(self, line: bytes) -> None:
         """Answer a line as the firmware does, and start its motion."""
         if line == b"\n":
-            return None
+            return
         if self.lose:
             self.lose -= 1
             return
         try:
-            c = Command.decode(line)
+            command = Command.decode(line)
         except ProtocolError:
-            return self.say(Reply("error", None, StageError.BAD_CRC))
-        if self._last and self._last[0] == c.sequence and c.verb != "HELLO":
-            self.say(self._last[1])
-            if self._end and self._end[0] == c.sequence:
-                self.say(self._end[1])
-            return None
-        self.seen.append(c)
-        number = self._refusal(c)
-        fields = {"steps": self.steps} if c.verb == "HELLO" else {}
+            self.say(Reply("error", None, StageError.BAD_CRC))
+            return
+        # A repeated command has the number of the last one: it gets the same answers, and is not executed again.
+        last_number, last_answer = self._last or (None, None)
+        if last_answer is not None and last_number == command.sequence and command.verb != "HELLO":
+            self.say(last_answer)
+            number_of_motion, end_of_motion = self._end or (None, None)
+            if end_of_motion is not None and number_of_motion == command.sequence:
+                self.say(end_of_motion)
+            return
+        self.seen.append(command)
+        number = self._refusal(command)
+        fields = {"steps": self.steps} if command.verb == "HELLO" else {}
         if number:
-            reply = Reply("error", c.sequence, number)
+            reply = Reply("error", command.sequence, number)
         else:
-            reply = Reply("ok", c.sequence, fields=fields)
-        self._last = (c.sequence, reply)
+            reply = Reply("ok", command.sequence, fields=fields)
+        self._last = (command.sequence, reply)
         self.say(reply)
         if not number:
-            self._carry_out(c)
+            self._carry_out(command)
 
-    def _refusal(self, c: Command) -> int:
+    def _refusal(self, command: Command) -> int:
         """Number of the error with which a command is refused; 0: it is accepted."""
-        if c.verb in ("HOME", "MOVE", "ROW", "BUZZ", "SET") and self.moving:
+        if command.verb in ("HOME", "MOVE", "ROW", "BUZZ", "SET") and self.moving:
             return StageError.BUSY
-        if c.verb in ("HOME", "MOVE", "ROW") and self.alarm:
+        if command.verb in ("HOME", "MOVE", "ROW") and self.alarm:
             return StageError.IN_ALARM
-        if c.verb in ("MOVE", "ROW") and not self.homed:
+        if command.verb in ("MOVE", "ROW") and not self.homed:
             return StageError.NOT_HOMED
         return 0
 
-    def _carry_out(self, c: Command) -> None:
+    def _carry_out(self, command: Command) -> None:
         """Clear an alarm, or start a motion after the previous one has ended."""
-        if c.verb == "CLEAR":
+        if command.verb == "CLEAR":
             self.alarm = 0
-        elif c.verb in ("HOME", "MOVE", "ROW", "BUZZ"):
+        elif command.verb in ("HOME", "MOVE", "ROW", "BUZZ"):
             if self._motion:
                 self._motion.join()
             self.moving = True
             self._stopping.clear()
-            self._motion = threading.Thread(target=self._move, args=(c,))
+            self._motion = threading.Thread(target=self._move, args=(command,))
             self._motion.start()
 
-    def _move(self, c: Command) -> None:
+    def _move(self, command: Command) -> None:
         """Run a motion in a thread of its own, and report its end, unless `lose_end` is not 0."""
         try:
-            number = self._run_row(c) if c.verb == "ROW" else self._run_other_motion(c)
+            number = self._run_row(command) if command.verb == "ROW" else self._run_other_motion(command)
         except PolysightError:
             # The hub of the simulated wires was closed.
             return
-        self.moving = self.held = False
+        self.moving = False
+        self.held = False
         if self._closed.is_set():
             return
         position = {"points": self.points, "pulses": self.points, "x": self.x, "y": self.y}
@@ -353,25 +366,25 @@ class FakeStage:
             self.alarm = number
             end = Reply("alarm", number=number)
         else:
-            lost_steps = {"lostx": self.lost[0], "losty": self.lost[1]} if c.verb == "HOME" else {}
-            end = Reply("done", c.sequence, fields={k: str(v) for k, v in (position | lost_steps).items()})
-        self._end = (c.sequence, end)
+            lost_steps = {"lostx": self.lost[0], "losty": self.lost[1]} if command.verb == "HOME" else {}
+            end = Reply("done", command.sequence, fields={k: str(v) for k, v in (position | lost_steps).items()})
+        self._end = (command.sequence, end)
         if self.lose_end:
             self.lose_end -= 1
         else:
             self.say(end)
 
-    def _run_other_motion(self, c: Command) -> int:
+    def _run_other_motion(self, command: Command) -> int:
         if self._stopping.wait(self.pace_s):
             return StageError.STOPPED
-        if c.verb != "BUZZ":
+        if command.verb != "BUZZ":
             self.homed = True
-            self.x, self.y = c.args[:2] if c.verb == "MOVE" else (0, 0)
+            self.x, self.y = command.args[:2] if command.verb == "MOVE" else (0, 0)
         return 0
 
-    def _run_row(self, c: Command) -> int:
+    def _run_row(self, command: Command) -> int:
         """Move along the points of a row, with the faults that the test has set; return an alarm's number or 0."""
-        x_start, dx, points, self.y, feed = c.args
+        x_start, dx, points, self.y, feed = command.args
         self.rows_run += 1
         step_ns = abs(dx) * 10**9 // feed
         self.points = 0
@@ -394,13 +407,14 @@ class FakeStage:
         # The stage passes the last point and slows down.
         if self._stopping.wait(2 * self.pace_s):
             return StageError.STOPPED
-        self.x, self.y = self.row_end or _find_rest_position(c)
+        self.x, self.y = self.row_end or _find_rest_position(command)
         return 0
 
     def _edge(self, t_ns: int) -> None:
         """Raise the trigger for 20 microseconds of the wires' time."""
         if self.wire:
-            edges = WireEdge(t_ns, self.trigger, 1), WireEdge(t_ns + 20_000, self.trigger, 0)
-            self.wire.send(*edges, WireEdge(t_ns, MARK_LINE, 1))
+            rising = WireEdge(t_ns, self.trigger, 1)
+            falling = WireEdge(t_ns + 20_000, self.trigger, 0)
+            self.wire.send(rising, falling, WireEdge(t_ns, MARK_LINE, 1))
             # Wait until the hub has delivered the edges: a wire has no delay, so they must come before the next line.
             self.wire.receive(HANG_S)

@@ -65,7 +65,7 @@ class Bus(IBackend):
     Attributes
     ----------
     packet
-        A read returns at most so many bytes of data. Tests set it to cut answers at any byte.
+        Largest number of data bytes that a read returns. Tests set it to cut answers at any byte.
     refuses
         Error number (errno) with which a claim of an interface is refused; 0: it is accepted.
     """

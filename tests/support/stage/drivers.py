@@ -301,7 +301,9 @@ class PortDriver(Driver):
         super().__init__()
         self._speed = speed
         self._port = serial.Serial(port, 115200, timeout=0.02)
-        self._partial = self._sent = b""
+        # Lines that were received or sent without their end so far
+        self._partial = b""
+        self._unfinished = b""
         self._listen_for_banner()
 
     def _listen(self, seconds: float = 0.0) -> None:
@@ -330,9 +332,12 @@ class PortDriver(Driver):
 
     def send(self, data: bytes) -> None:
         """Send bytes and wait for the answers: one for each line and one for a single STATUS byte."""
-        *lines, self._sent = (self._sent + data).split(b"\n")
-        answers = sum(bool(line.translate(None, bytes(Immediate))) for line in lines)
-        answers += data == bytes([Immediate.STATUS])
+        *lines, self._unfinished = (self._unfinished + data).split(b"\n")
+        # Immediate bytes may come within a line, and are no part of it. Empty lines have no answer.
+        lines_without_immediate_bytes = [line.translate(None, bytes(Immediate)) for line in lines]
+        answers = len([line for line in lines_without_immediate_bytes if line])
+        if data == bytes([Immediate.STATUS]):
+            answers += 1
         complete = self.received.count(b"\n")
         self._port.write(data)
         self.wait_until(lambda: self.received.count(b"\n") >= complete + answers)
@@ -358,7 +363,9 @@ class PortDriver(Driver):
     def reset(self) -> None:
         """Open the port again: that resets a board by the line DTR, and a simulated stage at a pseudo terminal."""
         self._port.close()
-        self.received = self._partial = self._sent = b""
+        self.received = b""
+        self._partial = b""
+        self._unfinished = b""
         self._port.open()
         self._listen_for_banner()
 

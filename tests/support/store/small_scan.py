@@ -27,6 +27,7 @@ from polysight_pi.journal import Journal, JournalFullError, NewEvent
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.errors import PolysightError
+from polysight_shared.faults import PiFault
 from polysight_shared.raster import plan_raster
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.scene import SimulatedRig, load_scene, row_offsets_mm
@@ -35,7 +36,7 @@ from tests.support.pipelines import make_pipeline
 from tests.support.rigs import load_published_rig
 from tests.support.scenes import write_small_scene
 
-SCENE = write_small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
+SCENE = write_small_scene(columns=3, rows=3, step_mm=(20.0, 20.0), pixels=12)
 
 
 class Samples:
@@ -96,9 +97,10 @@ class SmallPi:
         self._commit(m.RunStarted, {"plan": run.plan, "resumed": resumed, "lost_events": lost_events})
 
     def status(self) -> m.StatusReply:
+        number = PiFault.JOURNAL_FULL if self.state == "fault" else 0
         return m.StatusReply(
             state=self.state, homed=True, x_mm=0, y_mm=0, scan_id=self._scan_id, row_index=-1, take=0, points=0,
-            pulses=0, last_seq=self._journal.last_seq, fault=109 if self.state == "fault" else 0, reason=self.fault,
+            pulses=0, last_seq=self._journal.last_seq, fault=number, reason=self.fault,
         )  # fmt: skip
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
@@ -194,7 +196,7 @@ class SmallRig:
         data = self._samples.get_payload(name, row)
         log = PacketLog(len(data))
         evidence = Evidence(len(data), self._samples.instrument.frame_bytes, past=EarlierRecords.after_reset())
-        for k, packet in enumerate(encode_packets(data, 1, 0)):
+        for k, packet in enumerate(encode_packets(data, sequence=1, byte_count=0)):
             log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), k + 1)
         placed, out = place_record(log, evidence.frame_bytes)
         crc = segment.finish(out)

@@ -1,5 +1,5 @@
-"""`polysight`: the command line. It parses, and calls one function, mostly of `polysight.jobs`; it computes nothing.
+"""The command line `polysight`: it parses the options and calls one function, in most cases of `polysight.jobs`.
 
-`main.FAMILIES` says which module adds which commands; only the family of the command that was asked for is imported.
-Options that several commands share are in `options`.
+`main.FAMILIES` lists the commands that each module adds; only the module of the given command is imported. Options that
+several commands share are in `options`.
 """

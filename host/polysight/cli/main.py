@@ -1,9 +1,10 @@
 """The program `polysight`: parse the command line and run one command.
 
-The exit status is 0 only when the command worked, or when the reader of its output has closed the pipe (`| head`).
+The exit status is 0 only if the command worked, or if the reader of its output has closed the pipe (`| head`).
 
-Only the module of the command is imported, so that every command starts without delay; and it is imported below `main`,
-where Ctrl-C ends the program without a traceback. Errors go to stderr: what happened, why, and what to do.
+Only the module of the command is imported, so that every command starts without delay. It is imported after `main` was
+called, so that Ctrl-C during the import ends the program without a traceback. Errors go to stderr: what happened, why,
+and what to do.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import sys
 from polysight_shared import __version__
 
 TYPE_CHECKING = False
-"""True for a type checker, as in the module `typing`, which takes longer to import than all above."""
+"""True for a type checker. The same constant of `typing` is not used, because that module takes longer to import than
+all modules above together."""
 
 if TYPE_CHECKING:
     import argparse
@@ -123,7 +125,8 @@ def _run(words: list[str]) -> int:
     except SystemExit:
         flush_standard_output()
         raise
-    # Two BLAS threads on two busy cores wait for each other in a spin: ten times slower than one thread each.
+    # On busy cores the threads of BLAS wait for each other in a loop: two threads on two busy cores take ten times as
+    # long as one.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     status = args.run(args)
     flush_standard_output()

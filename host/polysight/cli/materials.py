@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def _run_materials(args: argparse.Namespace) -> int:
-    """Run `polysight materials`. Raises ConfigError unless either scans or the catalogue are asked for."""
+    """Run `polysight materials`. Raises ConfigError unless either scans or the catalogue are given."""
     from polysight.jobs.materials import catalogue, materials
 
     if bool(args.data) == args.catalogue:
@@ -282,11 +282,19 @@ _LABEL_EXAMPLES = (
 
 
 def _label(args: argparse.Namespace) -> int:
-    """Run `polysight label`; names are asked for only at a terminal."""
+    """Run `polysight label`, which asks for names only at a terminal."""
     from polysight.jobs.label import Edits, label
 
-    edits = Edits(args.from_patches, args.remove, args.rename, args.box, args.specimen, args.metal)
-    return label(args.scan, edits, args.list, input if sys.stdin.isatty() else None)
+    edits = Edits(
+        from_patches=args.from_patches,
+        removed=args.remove,
+        renames=args.rename,
+        boxes=args.box,
+        specimens=args.specimen,
+        metal=args.metal,
+    )
+    ask = input if sys.stdin.isatty() else None
+    return label(args.scan, edits, list_only=args.list, ask=ask)
 
 
 def _parse_box(text: str) -> tuple[str, tuple[float, float, float, float]]:

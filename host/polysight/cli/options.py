@@ -20,7 +20,7 @@ from polysight_shared.errors import ConfigError, ErrorCode
 RIG_FILE = Path("instrument.toml")
 # Number of options that help shows before "more options"; chosen.
 _OPTIONS_SHOWN = 3
-# Largest coordinate of a box: far beyond any image, so that a unit mixed up is noticed.
+# Largest coordinate of a box: far outside of any image, so that a wrong unit is noticed.
 _FARTHEST_MM = 10_000
 # Names in a parsed command line that are not options.
 _OF_THE_PARSER = ("command", "action", "run")
@@ -51,9 +51,9 @@ class CommandParser(argparse.ArgumentParser):
         groups = self._action_groups[2:]
         grouped = [a for group in groups for a in group._group_actions]
         options = [a for a in self._actions if a.option_strings and a not in grouped]
-        # False sorts first: the required ones, the most used, the others, --help.
+        # The keys are sorted with False first: required options, the most used ones, the others, and --help at the end.
         options.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
-        # A section with --help alone is left out.
+        # There is no section "more options" that has only --help.
         first = _OPTIONS_SHOWN
         if len(options) <= _OPTIONS_SHOWN + 1:
             first = len(options)
@@ -86,7 +86,7 @@ options of the command have the names of the function's parameters."""
 
 
 def set_run(sub: argparse.ArgumentParser, run: Run) -> None:
-    """Have a command run a function; the module of a named one is loaded when the command runs."""
+    """Set the function of a command; if it is given by name, its module is loaded when the command runs."""
     if isinstance(run, str):
         run = partial(_run_job, run)
     sub.set_defaults(run=run)
@@ -166,9 +166,10 @@ def material_settings(args: argparse.Namespace) -> Settings:
 
 
 def rig_file(config: Path | None, data: Path) -> Path | None:
-    """Return the given rig file, or the one in the folder of the data, or in the current folder; None without any.
+    """Return the given rig file, else that in the folder of the data, else that in the current folder, else None.
 
-    For published data, which lacks the rig's geometry, the packaged one comes last: it is the published rig's.
+    Published data do not contain the geometry of the rig: without another rig file they get the packaged one, which is
+    that of the published rig.
     """
     given_file = config or next((rig for rig in (data / RIG_FILE, RIG_FILE) if rig.exists()), None)
     if given_file is not None:
@@ -192,7 +193,7 @@ def box(text: str) -> Box:
 
 
 def parse_centred_box(text: str) -> Box:
-    """Parse `x,y,width,height`, the form of a box in earlier releases; say how it is written now."""
+    """Parse `x,y,width,height`, the form of a box in earlier releases; print the present form."""
     x, y, width, height = _parse_four_numbers(text, "x,y,width,height in mm, e.g. 0,0,40,40")
     if width <= 0 or height <= 0:
         raise argparse.ArgumentTypeError(f"width and height of {text!r} must be positive")
@@ -294,7 +295,10 @@ Number = TypeVar("Number", int, float)
 
 
 def number(kind: Callable[[str], Number], rule: str, holds: Callable[[Number], bool]) -> Callable[[str], Number]:
-    """Return a `type` for argparse: a number for which `holds` is true; else the error is "... is not `rule`"."""
+    """Return a `type` for argparse: a number for which `holds` is true.
+
+    For any other text the error is "... is not `rule`".
+    """
 
     def convert(text: str) -> Number:
         try:
@@ -310,5 +314,5 @@ def number(kind: Callable[[str], Number], rule: str, holds: Callable[[Number], b
 
 positive = number(float, "a number above 0", lambda value: 0 < value < math.inf)
 count = number(int, "a whole number, 1 or more", lambda value: value >= 1)
-# Up to the largest 64-bit integer, the seed of a scene file.
+# It is at most the largest signed integer of 64 bits, as the seed of a scene file.
 count_from_zero = number(int, "a whole number, 0 or more", lambda value: 0 <= value < 1 << 63)

@@ -73,7 +73,7 @@ def _process(args: argparse.Namespace) -> int:
     """Run `polysight process`: one scan in this program, several as a batch."""
     from polysight.jobs.output import say
 
-    # Before the other modules are loaded, which takes most of a second.
+    # This is printed before the other modules are loaded, which takes most of a second.
     say("checking data and settings")
     from polysight.jobs.batch import find_scans, process_several
     from polysight.jobs.process import process
@@ -81,9 +81,9 @@ def _process(args: argparse.Namespace) -> int:
     scans = find_scans(args.data)
     if len(args.data) == 1 and scans == args.data and args.dask is None:
         return process(args.data[0], args.out, process_settings(args, args.data[0]))
-    # The processes of a batch may have another working folder.
+    # The paths are absolute, because the processes of a batch may have another working folder.
     several = [(data, process_settings(args, data.absolute())) for data in scans]
-    return process_several(several, args.out, args.jobs, args.dask, args.again)
+    return process_several(several, args.out, at_a_time=args.jobs, dask=args.dask, again=args.again)
 
 
 def _run_surface(args: argparse.Namespace) -> int:

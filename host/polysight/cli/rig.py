@@ -32,7 +32,7 @@ from polysight_shared.errors import ConfigError, ErrorCode
 
 # Limits of options are chosen, far beyond values of a rig, unless a comment says otherwise.
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
-# Nearer than a few wavelengths (4 mm) no antenna sees a plane wave.
+# At less than a few wavelengths of 4 mm, an antenna does not see a plane wave.
 _distance = number(float, "a distance from 20 to 10000 mm", lambda value: 20 <= value <= 10_000)
 _seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
 _minutes = number(float, "a time of 0.01 to 100000 minutes", lambda value: 0.01 <= value <= 100_000)
@@ -185,7 +185,7 @@ def _add_doctor(add: AddCommand) -> None:
 def _program_card(args: argparse.Namespace) -> int:
     from polysight.jobs.devices import program_card
 
-    return program_card(args.config, args.name, args.mac, args.at, args.yes, args.wait)
+    return program_card(args.config, args.name, mac=args.mac, at=args.at, yes=args.yes, wait_s=args.wait)
 
 
 def _reset_card(args: argparse.Namespace) -> int:
@@ -199,7 +199,7 @@ def _add_board(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_own_config(sub: argparse.ArgumentParser) -> None:
-    """Add `--config` to an action, without a default, so that the one given before the action stays."""
+    """Add `--config` to an action, without a default, which would replace the value given before the action."""
     sub.add_argument("--config", type=Path, default=argparse.SUPPRESS, metavar="FILE", help="rig file")
 
 
@@ -260,7 +260,14 @@ def _inspect(args: argparse.Namespace) -> int:
         return inspect_placement(args.file, args.as_json)
     options = {"lanes": args.lanes, "samples": args.samples, "q_first": args.q_first}
     given_options = {name: value for name, value in options.items() if value is not None}
-    return inspect_file(args.file, args.config, args.plot, args.card, args.as_json, given_options)
+    return inspect_file(
+        args.file,
+        config=args.config,
+        plot=args.plot,
+        card_address=args.card,
+        as_json=args.as_json,
+        changes=given_options,
+    )
 
 
 def _add_inspect(add: AddCommand) -> None:
@@ -376,15 +383,27 @@ def _scan(args: argparse.Namespace) -> int:
     """Run `polysight scan`."""
     from polysight.jobs.live_scan import scan
 
-    settings = material_settings(args)
-    return scan(args.config, args.out, settings, args.truth, args.keep_incomplete, not args.no_process)
+    return scan(
+        args.config,
+        args.out,
+        material_settings(args),
+        truth=args.truth,
+        keep_incomplete=args.keep_incomplete,
+        process=not args.no_process,
+    )
 
 
 def _resume(args: argparse.Namespace) -> int:
     """Run `polysight resume`."""
     from polysight.jobs.live_scan import resume
 
-    return resume(args.folder, material_settings(args), args.keep_incomplete, not args.no_process, args.config)
+    return resume(
+        args.folder,
+        material_settings(args),
+        keep_incomplete=args.keep_incomplete,
+        process=not args.no_process,
+        config=args.config,
+    )
 
 
 def _validate(args: argparse.Namespace) -> int:
@@ -467,16 +486,18 @@ def _run_reproduce(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import require_package
 
     if args.config != find_packaged(RIG_FILE):
-        # Refuse a wrong one now, not with the first item that needs it.
+        # Refuse a wrong rig file now, and not only when the first item needs it.
         load_instrument(args.config)
     require_package("polysight_papers", "papers")
-    # The libraries for its figures take seconds to load.
+    # This is printed before the libraries for the figures are loaded, which takes seconds.
     sys.stderr.write("polysight reproduce: starting\n")
     sys.stderr.flush()
     if args.authors is not None:
         from polysight_papers.sensys2026.dataset_items import reproduce_authors
 
-        return reproduce_authors(args.authors, args.out, args.config, args.items, args.images, args.names)
+        return reproduce_authors(
+            args.authors, args.out, args.config, keys=args.items, images=args.images, names=args.names
+        )
     if args.images is not None or args.names is not None:
         raise ConfigError(
             "--images and --names say how to read the published files", "no --authors was given",
@@ -485,7 +506,7 @@ def _run_reproduce(args: argparse.Namespace) -> int:
     from polysight_papers.sensys2026.item import Run
     from polysight_papers.sensys2026.run import reproduce
 
-    return reproduce(args.out, args.items, Run(args.quick, args.config))
+    return reproduce(args.out, args.items, Run(quick=args.quick, config=args.config))
 
 
 def _add_simulated(add: AddCommand) -> None:

@@ -18,19 +18,23 @@ SCAN_COMMANDS = ("pause", "continue", "stop", "abort")
 
 
 def add_commands(add: AddCommand) -> None:
-    """Register the commands: name, function (`module.function`: loaded when it is run), help, example, main options."""
+    """Register the commands.
+
+    The arguments of `add` are name, function (a text `module.function` names one that is loaded when it runs), help,
+    example, and the options that the help shows first.
+    """
     _add_serve(add)
     _add_lists(add)
     _add_results(add)
 
 
 def _serve(args: argparse.Namespace) -> int:
-    """Run `polysight serve`; without `--config` with the rig file of the current folder, if there is one.
+    """Run `polysight serve`. Without `--config`, the rig file of the current folder is used, if there is one.
 
     Raises ConfigError if the rig file or a package is missing.
     """
     _check_extra()
-    # The modules of the server take seconds to load.
+    # This is printed before the modules of the server are loaded, which takes seconds.
     sys.stderr.write("polysight serve: starting\n")
     from polysight.serve import serve
 
@@ -71,7 +75,13 @@ def _make_place(args: argparse.Namespace) -> ServerAddress:
     """Return the address of the server from the options of `_add_place`."""
     from polysight.serve import ServerAddress
 
-    return ServerAddress(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
+    return ServerAddress(
+        host=args.host,
+        port=args.port,
+        hosts=tuple(args.allow_host),
+        certificate=args.certificate,
+        key=args.key,
+    )
 
 
 def _parse_port(text: str) -> int:

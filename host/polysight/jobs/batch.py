@@ -1,7 +1,8 @@
-"""Processing of many scans: one program each, as many at a time as cores and memory allow, here or on a Dask cluster.
+"""Processing of many scans, each in a separate program.
 
-A scan that fails, or whose program is killed because memory runs out, does not stop the others. Finished products have
-a mark file with their dependencies; a later run skips them unless data, options, rig file or version have changed.
+As many programs run at a time as cores and memory allow, on this machine or on a Dask cluster. A scan that fails, or
+whose program is killed because memory runs out, does not stop the others. Finished products have a mark file with
+everything that they depend on; a later run skips them unless data, options, rig file or version have changed.
 """
 
 from __future__ import annotations
@@ -52,8 +53,9 @@ _PRODUCTS = (IMAGE, QUALITY)
 WORKER_COMMAND = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
 PARENT_PIPE_VARIABLE = "POLYSIGHT_PARENT_ALIVE"
-"""Environment variable of the program: number of a pipe that closes when the program that started it ends."""
-# Leave a fifth of the free memory to the system: `memory_bytes` is an estimate, and other programs grow meanwhile.
+"""Environment variable of the worker: number of the read end of a pipe that closes when the parent program ends."""
+# A fifth of the free memory is left to the system (chosen): `memory_bytes` is an estimate, and other programs grow
+# meanwhile.
 SHARE_OF_FREE_MEMORY = 0.8
 # Time between two looks at a running program and at the request to stop; chosen.
 _POLL_S = 0.2
@@ -109,7 +111,7 @@ def find_scans(paths: Sequence[Path]) -> list[Path]:
     """
     folders: list[Path] = []
     for path in paths:
-        # The .npz files of products are no scans of their own.
+        # The .npz files of products are not scans.
         if path.is_dir() and not _is_data(path) and not (path / SCAN).exists():
             scans_inside = sorted(p for p in path.iterdir() if _is_data(p))
         else:
@@ -119,7 +121,7 @@ def find_scans(paths: Sequence[Path]) -> list[Path]:
 
 
 def _is_data(path: Path) -> bool:
-    """True for a scan of any layout, and for given images (H and V from elsewhere, without raw data)."""
+    """True for a scan of any layout, and for given images (H and V of another program, without raw data)."""
     return is_source(path) or is_given_images(path)
 
 
@@ -129,7 +131,7 @@ def make_jobs(scans: Sequence[tuple[Path, Settings]], out: Path) -> list[Job]:
     Raises
     ------
     ConfigError
-        when two scans have one name, and so one folder of products.
+        when two scans have the same name: their products would go into one folder.
     """
     jobs: dict[str, Job] = {}
     for folder, settings in scans:
@@ -159,9 +161,10 @@ _PUBLISHED_FILES = ("*_cfg.json", TRUTH, "*/*.bin", "*/*_log.csv", "*_synced.npy
 
 
 def describe_dependencies(data: Path, settings: Settings) -> dict[str, Any]:
-    """Return the dependencies of products: releases, options, and a digest of the data files' sizes and times.
+    """Return what products depend on: releases, options, and a digest of the data files' sizes and times.
 
-    An option that names a file counts by the digest of its content, one that names a folder as the data do.
+    An option that names a file is represented by a digest of the file's content, and one that names a folder by a
+    digest of sizes and times, as the data.
     """
     config = settings.path("config")
     options = settings.choices()
@@ -201,7 +204,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
     files: list[Path] = []
     # Errors are left to the program that processes the scan: its message is the result.
     with suppress(PolysightError):
-        # Without its raw data, too.
+        # `dropped`: a scan whose raw data was deleted is opened, too.
         source = open_source(folder, config, dropped=True)
         if isinstance(source, ScanFolder) and dropped_rows(source):
             patterns = (*patterns, f"{SAMPLES}/*")
@@ -212,7 +215,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
 
 
 def is_finished(job: Job) -> bool:
-    """True if images and quality exist, and the mark file names exactly the dependencies of this job."""
+    """True if images and quality exist, and the mark file has exactly the dependencies of this job."""
     try:
         mark = read_json(job.out / FINISHED)
     except (OSError, ValueError, PolysightError):
@@ -223,11 +226,11 @@ def is_finished(job: Job) -> bool:
 
 
 def run_scan(job: Job, stop: Event | None = None) -> Outcome:
-    """Process one scan in a program of its own; its output goes to `<out>.log`. Failures are part of the result.
+    """Process one scan in a child program, whose output goes to `<out>.log`; a failure is returned as an outcome.
 
-    That program ends when this one does, however this one ends, or when `stop` is set (None: on a Dask worker, where
-    nothing sets it). A scan with a mark is done: a Dask worker may have been killed between writing the mark and
-    reporting it.
+    The child ends when this program does, also if this is killed, or when `stop` is set. `stop` is None on a Dask
+    worker, where nothing sets it. A scan whose products have the mark is not processed again: a Dask worker may have
+    been killed after it wrote the mark and before it reported the outcome.
     """
     if is_finished(job):
         return _end_outcome(job)
@@ -235,7 +238,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     log = job.out.with_name(job.name + ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    # Nothing is written to the pipe: its end shows the child that this program has ended.
+    # Nothing is written to the pipe: that it closes shows the child that this program has ended.
     child_end, parent_end = os.pipe()
     try:
         environment[PARENT_PIPE_VARIABLE] = str(child_end)
@@ -352,12 +355,12 @@ def memory_bytes(positions: int) -> int:
 
 
 def fit_scans(positions: int, cores: int, free_bytes: int) -> int:
-    """Return the number of scans that fit cores and free memory; at least one."""
+    """Return the number of scans of this size for which there are cores and free memory; at least one."""
     return max(1, min(cores, int(SHARE_OF_FREE_MEMORY * free_bytes / memory_bytes(positions))))
 
 
 def free_memory_bytes() -> int:
-    """Return the memory that is available without swapping (Linux), else all of it; 0 on Windows."""
+    """Return the memory that is available without swapping (Linux), or the whole memory (macOS); 0 on Windows."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -465,7 +468,7 @@ def format_table(outcomes: Sequence[Outcome], out: Path) -> str:
         if outcome.memory_gb:
             memory = f"{outcome.memory_gb:.1f} GB"
         rows.append((outcome.name, outcome.status, seconds, memory, masked, patches, outcome.message or verdict))
-    # Two columns of words, four of numbers, and a last one without padding.
+    # There are two columns of words, four of numbers, and a last one that needs no padding.
     widths = [max(len(row[column]) for row in rows) for column in range(6)]
     lines = []
     for row in rows:

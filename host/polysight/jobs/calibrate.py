@@ -34,11 +34,12 @@ from polysight_shared.errors import ConfigError, DataError, ErrorCode
 from polysight_shared.files import require_writable_folder
 from polysight_shared.tables import to_builtins
 
-# Least number of pixels that show metal in all scans of `leakage`; chosen: 25 remain in each quarter for the error.
+# Least number of pixels that show metal in all scans of `leakage`; chosen. Each quarter of the plane, from which the
+# error is estimated, has 25 of them.
 LEAST_PIXELS = 100
-# No estimate of the leakage counts as more exact than this: the standards' own errors do not show in it.
+# Smallest standard error of a leakage. Errors of the plate and the strips themselves do not show in an estimate.
 LEAST_LEAKAGE_STD = 1e-3
-# Real mounts leak up to 0.1; a plate in the place of strips gives 1.
+# Largest leakage of a rig: real mounts leak up to 0.1, while a plate that was scanned instead of strips gives 1.
 MAX_LEAKAGE = 0.5
 
 
@@ -103,7 +104,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
             f"{name}: direct path to RX1 {place.direct_path_was_mm:.2f} -> {place.direct_path_mm:.2f}"
             f" +- {place.direct_path_standard_error_mm:.2f} mm",
         ]
-        # An error of more than half the prior (chosen): most of the answer is the prior.
+        # If the error is more than half of the prior's (chosen), most of the result comes from the prior.
         lines += [
             f"{name}: the scan does not show its shift along {axis}; a scan with a wider aperture does"
             for axis, e in zip("xyz", place.standard_error_mm, strict=True)
@@ -221,15 +222,15 @@ def leakage_of_scans(
     plate
         Scan of a whole metal plate that covers the plane.
     strips
-        (degrees from the vertical towards +x, scan) of strips that cover the plane: two orientations or more; one
-        gives the axial ratio alone: one leakage, taken as that of both boards.
+        (degrees from the vertical towards +x, scan) of strips that cover the plane, in two orientations or more. A
+        single orientation gives only the axial ratio: then both boards get the same leakage.
     config
         Rig file for scans in the authors' layout.
 
     Returns
     -------
     leakage, facts
-        The facts are plain values: `scans` (their ids), `simulated`, `pixels`, `leakage_std`, `incidence_deg`.
+        The facts are a dictionary: `scans` (their names), `simulated`, `pixels`, `leakage_std`, `incidence_deg`.
 
     Raises
     ------
@@ -276,11 +277,11 @@ def leakage_of_scans(
 def _estimate_leakage_std(
     plate: tuple[Image, Image], strips: Sequence[tuple[float, Image, Image]], mask: Mask, theta_rad: float
 ) -> float:
-    """Standard error of each part of the leakage, from the differences between the quarters of the plane.
+    """Return the standard error of each part of the leakage, from the differences between the quarters of the plane.
 
-    The errors by edges, by wires that are not straight and by uneven illumination differ from place to place, as
-    speckle does: the mean of four quarters has half of the standard deviation of one. The result is at least
-    `LEAST_LEAKAGE_STD`, and equal to it with fewer than two usable quarters.
+    Errors by edges, by wires that are not straight and by uneven illumination differ from place to place, as speckle
+    does. Therefore the mean of four quarters has half of the standard deviation of one. The result is at least
+    `LEAST_LEAKAGE_STD`, which is also returned if fewer than two quarters can be used.
     """
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
     middle = [float(np.median(index[mask])) for index in (rows, columns)]
@@ -329,7 +330,7 @@ def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | No
     ]
     gain = f"# H over V in the images: {imbalance_db:+z.2f} dB, {imbalance_deg:+z.1f} degrees"
     gain += f"; from {facts['pixels']} pixels"
-    # Plate and two strips are as many standards as unknowns, and agree in any case.
+    # With two orientations there are as many equations as unknowns, so that the standards always agree.
     if len(strips) > 2:
         gain += f", the standards agree within {measured.residual:.4f} rad"
     print_lines([*lines, gain])

@@ -1,6 +1,6 @@
 """`polysight demo`: the simulated rig and the host as separate processes, and the report at the end.
 
-The simulators are started as programs, never imported: nothing at run time depends on them.
+The simulators are started as programs and never imported, so that the host does not depend on them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TIME_SCALE = 40.0
 
 
 def require_package(package: str, folder: str) -> None:
-    """Check that another package of this project is installed; the wheels can be installed singly.
+    """Check that another package of this project is installed: a user may have installed only the host's wheel.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def run_simulator(arguments: Sequence[str]) -> int:
 
 
 def simulate_scene(scene: Path, config: Path, out: Path, seed: int | None = None) -> None:
-    """Write the simulated scan of a scene into `out`; only the simulator's notes are printed, at its end, to stderr.
+    """Write the simulated scan of a scene into `out`; the simulator's notes are printed to stderr when it has ended.
 
     Raises PolysightError with the simulator's message.
     """
@@ -101,7 +101,7 @@ def _check_folder(out: Path) -> None:
 
 
 def _make_fresh_folder(out: Path) -> None:
-    """Make a folder with the mark of a demo alone; an existing demo folder is overwritten."""
+    """Make a folder with nothing but the mark of a demo; an existing demo folder is overwritten."""
     if out.exists() and any(out.iterdir()):
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -113,8 +113,8 @@ def run_simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float
     """Run the simulated rig with its Pi process; yield the rig file with their addresses.
 
     `folder` gets that file and the logs, `time_scale` is the number of simulated seconds per second. The host controls
-    its radars over simulated USB (`--native`). The rig runs in a session of its own, so that Ctrl-C ends the scan first
-    and the rig after it.
+    its radars over simulated USB (`--native`). The rig runs in another session, which Ctrl-C does not reach: the scan
+    ends first, and this function ends the rig.
 
     Raises
     ------

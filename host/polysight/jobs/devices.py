@@ -40,9 +40,9 @@ from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.findings import Finding
 from polysight_shared.messages import Axis
 
-# A card that was switched off and on starts for a while. Timeout of a request to it, all attempts together; chosen.
+# Timeout of a request, with all its attempts, to a card that was switched off and on and may still be starting; chosen.
 _REPLY_TIMEOUT_S = 1.5
-# Time between two such requests; chosen.
+# Time between two requests to a card that may still be starting; chosen.
 _PAUSE_S = 0.2
 
 
@@ -205,8 +205,8 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
         else:
             if was_off:
                 return version
-        # Without a pause the loop would not rest while the host's interface is down, where each request fails
-        # immediately.
+        # While the host's network interface is down each request fails immediately, and without a pause the loop would
+        # take a whole core.
         time.sleep(_PAUSE_S)
     missing = "the card was not switched off"
     if was_off:
@@ -280,7 +280,7 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     sys.stdout.write(f"{image.name}: complete, for an AWR2243, patches {' and '.join(checked_image.patches)}\n")
     _check_trace(trace)
     link = _open_link(rig, name, clock, trace, slow)
-    # A flash is written by a board that was started without this image.
+    # A board writes its flash after it was started without this image.
     image_for_ram = None if flash else checked_image
     board = make_radar_board(rig, name, link, clock, image_for_ram)
     try:

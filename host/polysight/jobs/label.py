@@ -40,7 +40,8 @@ from polysight_shared.files import hold_folder, write_together
 METAL = "metal"
 MIN_PIXELS = 16
 """A box of fewer pixels (chosen) gets a note: a library would learn speckle from it."""
-# Largest margin at each edge, as a share of a patch's side: two fifths of a narrow patch remain; chosen.
+# Largest margin at each edge, as a share of a patch's side; chosen. Two fifths of a narrow patch remain between two of
+# them.
 _LARGEST_MARGIN = 0.3
 Ask = Callable[[str], str]
 """Prints a question and returns the answer; raises EOFError when the input ends."""
@@ -64,9 +65,10 @@ class Edits:
     """Changes to labels, applied in this order.
 
     `from_patches` replaces the boxes by one inside each patch of the products, named by the patch's number. `removed`
-    are names of boxes, `renames` are `OLD=NEW`, `specimens` `NAME=SPECIMEN_SEPARATOR`, where a specimen is one physical
-    piece of a material, kept apart from others when a library is judged; corners of `boxes` are millimetres from the
-    image centre. `metal` is the name of the box that becomes the metal reference; None keeps the present one.
+    are names of boxes, `renames` are `OLD=NEW`. `boxes` are names and corners, in millimetres from the image centre.
+    `specimens` are `NAME=SPECIMEN`: a specimen is one physical piece of a material, which is kept apart from others
+    when a library is judged. `metal` is the name of the box that becomes the metal reference; None keeps the present
+    one.
     """
 
     from_patches: bool = False
@@ -92,8 +94,8 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     Raises
     ------
     PolysightError
-        when there is no image, a box or name is refused, `list_only` meets edits, or the person does not confirm;
-        nothing was written then.
+        when there is no image, a box or name is refused, `list_only` is given with edits, or the person does not
+        confirm. Then nothing was written.
     """
     products = find_products(folder)
     if products is None:
@@ -154,9 +156,10 @@ def _check_unchanged(folder: Path, saved_labels: tuple[Path, Labels] | None) -> 
 def save_labels(
     folder: Path, products: ProcessedScan, labels: Labels, check_present: Callable[[], None] = lambda: None
 ) -> tuple[Labels, list[str]]:
-    """Check boxes drawn on products, and write them with their picture into a folder; return them with notes on them.
+    """Check boxes drawn on products, and write them with their picture into a folder; return the boxes and notes.
 
-    `check_present` is called just before, when no other program can change them; it raises to keep the present boxes.
+    `check_present` is called before writing, while no other program can change the boxes in the folder. If it raises an
+    error, these are kept.
 
     Raises
     ------
@@ -174,7 +177,7 @@ def save_labels(
     checked_labels = replace(
         checked_labels, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
     )
-    # Loads matplotlib, which is needed neither to list boxes nor to refuse them.
+    # Imported here, because it loads matplotlib, which is needed neither to list boxes nor to refuse them.
     from polysight.report import label_figure
 
     picture = label_figure(products, checked_labels.boxes, checked_labels.metal)
@@ -206,18 +209,18 @@ def remove_labels(folder: Path) -> Path:
     saved_labels = find_labels(folder)
     if saved_labels is None:
         raise DataError(f"{folder}: has no boxes", "none were saved", "draw some first", code=ErrorCode.FILE_MISSING)
-    path = saved_labels[0]
+    path, _ = saved_labels
     path.unlink()
     path.with_name(LABELS_PICTURE).unlink(missing_ok=True)
     return path
 
 
 def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
-    """Return the names of boxes too dark, H and V together, to be detected as plates automatically."""
+    """Return the names of boxes whose power in H and V is too low to be detected as plates automatically."""
     power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
     if not np.isfinite(power).any():
         return []
-    # Relative to the brightest pixels without the brightest per cent, which may be a glint.
+    # The power is compared with that of the brightest pixels, without the brightest per cent, which may be a glint.
     least_power = np.nanpercentile(power, 99) * 10 ** (SegmentSettings().dimmest_db / 10)
     power_in_box = {name: power[mask & products.valid] for name, mask in masks.items()}
     return [name for name, values in power_in_box.items() if values.size and np.nanmedian(values) < least_power]
@@ -282,7 +285,7 @@ def apply_edits(labels: Labels, patches: Sequence[PatchToName], edits: Edits) ->
         if name == metal:
             metal = None
 
-    # A patch that is given as the metal by its number is named metal, unless it is renamed too.
+    # If the metal is given by the number of a patch, this patch is named "metal", unless it is renamed too.
     if edits.from_patches and edits.metal in boxes:
         renamed = {old for old, _ in (_split_at_equals(text, boxes) for text in edits.renames)}
         if edits.metal not in renamed:
@@ -293,7 +296,7 @@ def apply_edits(labels: Labels, patches: Sequence[PatchToName], edits: Edits) ->
         new_names[old] = normalise_box_name(new)
     boxes = _rename_boxes(boxes, new_names)
     specimens = {new_names[name]: specimen for name, specimen in specimens.items()}
-    # None stays None: no box has an empty name.
+    # No box has an empty name: without a metal reference the result is None.
     metal = new_names.get(metal or "")
 
     for name, box in edits.boxes:
@@ -351,7 +354,7 @@ def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
 
 def _split_at_equals(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
     """Split `NAME=TEXT`, where NAME is a box and may contain `=`. Raises DataError."""
-    # The longest name that is a box counts.
+    # Take the longest part that is the name of a box.
     parts = text.split("=")
     for count in range(len(parts) - 1, 0, -1):
         name = "=".join(parts[:count])
@@ -388,7 +391,7 @@ def ask_for_names(patches: Sequence[PatchToName], ask: Ask) -> Labels:
 def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing: bool) -> tuple[str, bool]:
     """Ask until the answer is a valid new name or empty; return it, and True if it is the metal.
 
-    A further piece of a material that is there already is named MATERIAL#PIECE.
+    If a box has this name already, another piece of the same material gets the name MATERIAL#PIECE.
     """
     while True:
         answer = ask(question).strip()
@@ -414,7 +417,7 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
 
 
 def _ask_for_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
-    """Ask which box is the metal reference; None without an answer, so that a name of a metal decides."""
+    """Ask which box is the metal reference; None without an answer: then it is the box with a metal's name."""
     while answer := ask("which of them is the metal reference (Enter: the one with a metal's name): ").strip():
         try:
             return _find_box(answer, boxes)

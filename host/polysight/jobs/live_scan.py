@@ -1,7 +1,7 @@
 """`polysight scan` and `resume`: a scan that is processed while it runs, with a progress bar.
 
-Rows go into the images as they are committed, so that the products are there soon after the last row. With
-`--no-process` nothing of the processing is loaded.
+Each row is added to the images as soon as it is committed, so that the products are ready soon after the last row.
+With `--no-process` no module of the processing is loaded.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from polysight_shared.errors import ConfigError, PolysightError, ScanError, join
 if TYPE_CHECKING:
     from polysight.jobs.process import LiveProcessing
 
-# A web address that does not answer must not hold up the end of a command; chosen.
+# Timeout of the command and of the web address of a notification, which must not delay the end of a scan; chosen.
 NOTIFY_TIMEOUT_S = 20.0
 # A new scan's folder may hold the log of the program that starts it, and notes, and nothing else.
 _ALLOWED_ENTRIES = ("program", "operator.json")
@@ -63,7 +63,7 @@ def _format_clock(seconds: float | None) -> str:
 
 
 class _PlainConsole(Console):
-    """Console that raises OSError for a closed pipe; rich's own would exit and silence stdout."""
+    """Console that raises OSError for a closed pipe; the console of rich would silence stdout and exit."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError("no program reads the messages now")
@@ -122,7 +122,7 @@ class ScanBar:
                 self._print(f"{progress.committed} of {progress.rows} rows, {_format_clock(progress.remaining_s)}")
 
     def _print(self, text: str) -> None:
-        """Print a line as it is: rich would take brackets, as of `[stage]`, for its markup, and colour numbers."""
+        """Print a line unchanged: rich would read brackets, as in `[stage]`, as markup, and would colour numbers."""
         self._console.print(Text(text))
 
 

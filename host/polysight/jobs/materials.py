@@ -1,7 +1,7 @@
 """Commands on saved products: materials, report, permittivity through layers, concentration, classify.
 
-Each prints the verdict first, and no patches if it is `none`. JSON lists the patches even then, as the products do:
-without names and permittivities.
+Each command prints the verdict first. If it is `none`, no patches are printed; JSON output lists them without names and
+permittivities, as the products do.
 """
 
 from __future__ import annotations
@@ -49,9 +49,10 @@ from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, quote
 from polysight_shared.findings import Finding
 
-# Relative difference of two frequencies that are the same: far above rounding, far below any other chirp.
+# Two frequencies are the same within this relative difference: far above rounding, far below the difference to any
+# other chirp.
 _SAME_FREQUENCY = 1e-6
-# Largest number of a verdict's reasons that the terminal shows; the report lists all; chosen.
+# Largest number of a verdict's reasons that the terminal shows; chosen. The report lists all of them.
 _REASONS = 3
 
 
@@ -414,7 +415,7 @@ def _score_models(data: Path, as_json: bool) -> int:
         sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
         library = library.at_angle(library.angles_deg[-1])
     samples = Samples.from_library(library)
-    # Two for each model: whole scans left out, then single pixels.
+    # Each model has two scores: with whole scans left out, then with single pixels left out.
     scores = [score(samples, model, by_pixel=score_by_pixel) for model in MODELS for score_by_pixel in (False, True)]
     source = _describe_origin(library.simulated)
     if as_json:

@@ -1,6 +1,6 @@
-"""Surfaces in the rows that a pipeline holds: specular points, gains, analysis, names, and the files.
+"""Measure curved and tilted surfaces in the rows of a scan: specular points, gains, analysis, names, and the files.
 
-Used by `polysight surface`, and by `polysight process` where a patch is neither flat nor level.
+`polysight surface` uses these functions, and so does `polysight process` if a patch is neither flat nor level.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> surfaces.Sampl
 def find_uncertainty(rig: Instrument, *, places_known: bool) -> surfaces.Uncertainty:
     """Return the standard errors of leakage, axes and places of a rig."""
     polarimetry = rig.polarimetry
-    # The prior is the size of the complex leakage; an error is that of one of its two parts.
+    # The prior is the rms of |leakage|; the standard deviation of its real and of its imaginary part is smaller by
+    # sqrt(2).
     leakage = polarimetry.leakage_prior / np.sqrt(2)
     if polarimetry.leakage_std is not None:
         leakage = polarimetry.leakage_std
@@ -93,7 +94,7 @@ def find_points_in_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces
 
 
 def make_reference(metal: surfaces.SeenEchoes) -> surfaces.Reference:
-    """Return a function from a rig's optics to the gains of both receivers that these points of metal give with it."""
+    """Return a function that computes the gains of both receivers from these points of metal and a rig's optics."""
 
     def learn(optics: surfaces.Optics) -> surfaces.Gains:
         return surfaces.learn_gains(surfaces.find_voltages(metal, optics), optics.wave_number)
@@ -118,7 +119,7 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
     count = len(rows)
     # Second derivatives [n, 2, 2] of the path by the stage offset.
     bend = np.stack([rows[:, [6, 7]], rows[:, [7, 8]]], axis=1)
-    # Files of older versions end before the rise over the band: none is assumed then.
+    # Files of older versions have no column for the rise over the band, which is then assumed to be 0.
     band_rise = np.zeros(count)
     if rows.shape[1] > 12:
         band_rise = rows[:, 12]
@@ -129,7 +130,7 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
         bend=bend,
         amplitude=rows[:, 9] + 1j * rows[:, 10],
         amplitude_std=rows[:, 11],
-        # The file does not hold these three, on which the gains do not depend.
+        # The file does not contain the next three, on which the gains do not depend.
         path_std_m=np.zeros(count),
         slope_std=np.zeros((count, 2)),
         share=np.zeros(count),
@@ -138,7 +139,7 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
 
 
 def thin_out(metal: surfaces.SeenEchoes) -> surfaces.SeenEchoes:
-    """Return at most `KEPT_POINTS` points of metal, evenly taken: neighbours see overlapping parts of the surface."""
+    """Return at most `KEPT_POINTS` points of metal, evenly spaced: neighbours see overlapping parts of the surface."""
     index = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
     return metal[index]
 
@@ -149,7 +150,7 @@ def analyse_points(
     seen_rows: surfaces.SeenEchoes,
     reference: surfaces.Reference | None = None,
 ) -> surfaces.Surface:
-    """Return the surfaces of a scan's points, named; without a metal `reference` the calibration's sphere is it."""
+    """Return the named surfaces of a scan's points; without a metal `reference` the calibration's sphere is used."""
     calibration = pipeline.calibration
     if reference is None and calibration.sphere is not None:
         reference = make_reference(load_sphere_points(calibration.sphere))

@@ -1,6 +1,7 @@
 """Output of commands: results and questions on stdout; progress on stderr.
 
-Progress is one line for each step. For a counted step it is also a bar on a terminal, or elsewhere occasional lines.
+Each step prints one line. The progress of a step with a known number of parts is shown by a bar on a terminal, and
+elsewhere by occasional lines.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def exit_status(worked: bool) -> int:
 
 
 def load_rig_file(config: Path | None) -> Instrument | None:
-    """Return the rig of a file; None without a file (the scan's own rig counts). Raises ConfigError."""
+    """Return the rig of a file; None without a file: the rig in the scan's folder is used. Raises ConfigError."""
     if config is None:
         return None
     return load_instrument(config)
@@ -60,9 +61,9 @@ def say(step: str) -> None:
 
 
 def steps(items: Sequence[T], names: Sequence[str]) -> Iterator[T]:
-    """Yield the things, one a step; print the name of each before it begins, and its wall time when it is done.
+    """Yield the items, each of which is a step; print the name of a step before it, and its wall time after it.
 
-    Each is a line of its own, because a step may print lines, too.
+    Name and time are on two lines, because a step may print lines between them.
     """
     for k, (item, name) in enumerate(zip(items, names, strict=True), 1):
         say(f"[{k}/{len(items)}] {name}")
@@ -72,10 +73,10 @@ def steps(items: Sequence[T], names: Sequence[str]) -> Iterator[T]:
 
 
 def count_steps(items: Iterable[T], total: int, name: str) -> Iterator[T]:
-    """Yield the things with a bar for the number that is done, of `total`.
+    """Yield the items, and show on a bar how many of `total` are done.
 
-    Without a terminal it is a line at the start, then one each time another tenth is done, but not until 5 s after the
-    line before.
+    Without a terminal a line is printed at the start, and after each tenth of the items unless less than 5 s have
+    passed since the last line.
     """
     from rich.console import Console
     from rich.progress import track

@@ -125,8 +125,8 @@ def check_inputs(settings: Settings, inputs: Inputs, calibration: Calibration, r
 def publish_images(pipeline: Pipeline, out: Path, check: Callable[[], None] | None = None) -> None:
     """Write images and recording quality before the materials are known, unless `out` contains a report.
 
-    The stage's backlash is left to the final products. `check` raises if they must not be written; it is called when
-    `out` is locked. Raises PolysightError.
+    The stage's backlash is estimated later, for the final products. `check` is called while `out` is locked, and raises
+    an error if the images must not be written. Raises PolysightError.
     """
     if (out / REPORT).exists():
         return
@@ -183,7 +183,10 @@ def make_products(
 
 
 def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
-    """Return the error of images without a valid pixel. A board without any valid position is named: P needs both."""
+    """Return the error of images without a valid pixel.
+
+    It names the boards without any valid position: P needs both.
+    """
     cause = "nothing was recorded, or all of it was masked"
     boards = " and ".join(pipeline.quality.boards_masked)
     if boards:
@@ -197,7 +200,7 @@ def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
 
 
 def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
-    """Make a reference from images of a metal plate. Raises DataError if they show none, or a plate of no metal."""
+    """Make a reference from images of a metal plate. Raises DataError if they show no plate, or another material."""
     reference = plane_reference(images.level(images.valid), name=pipeline.source.scan_id)
     ratio = reference.v[reference.valid] / reference.h[reference.valid]
     level_db = 20 * float(np.log10(np.median(np.abs(ratio))))
@@ -285,7 +288,7 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
 
 
 def _check_not_recorded(data: Path, out: Path) -> None:
-    """Raise ScanError if products would go where a running scan puts its own."""
+    """Raise ScanError if `out` is the folder into which a running scan will write its products."""
     if out.resolve() != (data / PRODUCTS).resolve() or not (data / MANIFEST).is_file():
         return
     if manifest.is_being_written(data / MANIFEST):
@@ -297,7 +300,7 @@ def _check_not_recorded(data: Path, out: Path) -> None:
 
 
 def _check_same_rows(pipeline: Pipeline, data: Path, out: Path) -> None:
-    """Raise ScanError if products of fewer rows than the scan has now would go where the scan puts its own.
+    """Raise ScanError if `out` is the scan's own folder of products, and the scan now has more rows than were read.
 
     The scan may have been resumed since its rows were read; it may even have ended.
     """
@@ -385,7 +388,7 @@ class LiveProcessing:
         was_in_order = {name: not board.rx_order for name, board in self._pipeline.quality.boards.items()}
         self._pipeline.add_row(row)
         for name, board in self._pipeline.quality.boards.items():
-            # Reported with the row that shows it, not after the scan.
+            # Report a dead RX immediately, with the row that shows it, and not only after the scan.
             new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in dead_rx_before[name]}
             for finding in rules.judge_dead_rx(name, new, rows=1):
                 _log.warning("row %d: %s", row, format_one_line(finding))
@@ -411,7 +414,7 @@ class LiveProcessing:
 
 
 def _check_dropped(pipeline: Pipeline, out: Path) -> None:
-    """Note dropped raw data as the products in `out` do. Raises DataError if the new ones have fewer rows."""
+    """Copy the note on dropped raw data from the products in `out`. Raises DataError if new ones have fewer rows."""
     if not isinstance(pipeline.source, ScanFolder) or not (mark := raw_dropped(out)):
         return
     pipeline.source.reload()
@@ -469,14 +472,17 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     else:
         depth_m = sharpest.depth_mm / 1e3
     grid = pipeline.builder.grid
-    # The image of H in the rig file's plane and in the one that was found, without footprint and notice.
-    board = pipeline.builder.boards[source.instrument.receivers[0].name]
-    pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
+    # Image H in the plane of the rig file, and in the plane that was found.
+    board_h, _ = source.instrument.receivers
+    board = pipeline.builder.boards[board_h.name]
+    image_in_given_plane, _footprint, _notice = board.image()
+    image_in_found_plane, _footprint, _notice = board.image(replace(grid, z_m=grid.z_m + depth_m))
+    pictures = (image_in_given_plane, image_in_found_plane)
     # A scan recorded column by column is processed as that of a mirrored rig.
     if source.mirrored:
         sharpest = sharpest.transpose()
         plates_plane = plates_plane.transpose()
-        pictures = (pictures[0].T, pictures[1].T)
+        pictures = (image_in_given_plane.T, image_in_found_plane.T)
     sweep = sharpest.to_dict() | {"plates": plates_plane.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
     (out / "focus.png").write_bytes(draw_focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))

@@ -33,9 +33,10 @@ from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError, ErrorCode, PolysightError
 from polysight_shared.files import require_writable, write_atomically
 
-# Missing ranges that are printed: they fill about one line of a terminal.
+# Largest number of missing ranges that are printed: as many fill about one line of a terminal.
 _MAX_RANGES = 8
-# Lowest level in the plot of a range profile, over its median (chosen): an antenna that stays below has "no signal".
+# Lowest level in the plot of a range profile, relative to the median of the profile; chosen. An antenna whose profile
+# is below it everywhere gets the label "no signal".
 BOTTOM_DB = -20.0
 
 
@@ -164,7 +165,7 @@ def inspect_file(
         from polysight.results import to_plain
 
         content = asdict(report)
-        # In JSON the fields of the layout are on the same level as the others, not in an object of their own.
+        # In JSON the fields of the layout are on the same level as the others, not in an inner object.
         content |= content.pop("layout")
         print_json(to_plain(content))
     else:
@@ -241,7 +242,8 @@ def inspect_placement(file: Path, as_json: bool) -> int:
                 "`polysight validate SCAN` shows whether it is complete",
             )
     result = place_again(row)
-    # This placement is by byte counts: frames that were placed by their pulses lie elsewhere, with other ranges.
+    # Packets are placed by their byte counts here. Frames that were placed by their pulses lie elsewhere, and their
+    # missing ranges cannot be compared.
     is_same = result.by_pulses or result.missing_before == result.placed.missing
     if as_json:
         print_json({**result.placed.facts(), "committed_missing": result.missing_before, "same": is_same})
@@ -251,9 +253,10 @@ def inspect_placement(file: Path, as_json: bool) -> int:
 
 
 def _format_placement(file: Path, result: PlacedAgain, is_same: bool) -> list[str]:
-    """Return lines about the placement of a row's packets; `is_same`: it was committed like this.
+    """Return lines about the placement of a row's packets; `is_same` says if the row was committed with this placement.
 
-    `start`: the card's packet and byte counts at the row's first byte; `located`: the place of each byte is certain.
+    The line `start` says if the card's packet and byte counts at the row's first byte are known, the line `located` if
+    the place of each byte is certain.
     """
     placed = result.placed
     evidence = result.evidence

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 _NAME_WIDTH = 40
-"""Widest column of names; a longer name pads no other line."""
+"""Largest width of the column of names. A longer name does not widen the column."""
 
 
 def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
@@ -105,7 +105,7 @@ def _format_summary(summary: Summary) -> str:
 
 
 def _join_searchable_text(summary: Summary) -> str:
-    """Return all text of a scan's summary that a search looks at, in small letters."""
+    """Return the text in which a search looks for words: fields of the summary, in small letters."""
     return " ".join(
         (summary.name, summary.scan_id, summary.rig, summary.state, summary.notes, *summary.tags, *summary.materials)
     ).casefold()
@@ -243,12 +243,13 @@ CONFIRMATION_WORD = "drop"
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     """Delete the raw data of processed rows after confirmation; return the exit status.
 
-    Products with a report and whole samples of every dropped row must remain; no other program may be writing them.
+    Products with a report and undamaged samples of every dropped row must remain, and no other program may be writing
+    them.
 
     Raises
     ------
     DataError
-        when products or samples are not complete, or were made from nothing of this scan.
+        when products or samples are not complete, or the products were not made from rows of this scan.
     ConfigError
         when it is not confirmed, or products are being written; nothing was removed.
     DeviceError
@@ -377,7 +378,7 @@ def check_scan(scan: ProcessedScan) -> CheckResult:
 
 
 def check_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckResult]]:
-    """Return the scans with a check plate in these folders; those of a folder of scans oldest first.
+    """Return the scans with a check plate in these folders; scans below one folder come oldest first.
 
     Raises
     ------

@@ -36,12 +36,13 @@ from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode
 from polysight_shared.files import require_writable_folder
 
-# Fronts of objects lie up to this before or behind the object plane; chosen.
+# Largest distance of the front of an object from the object plane, to either side; chosen.
 DEPTH_M = 0.12
-# Least number of points of a metal sphere for its radius and gains; chosen: with few the directions are not covered.
+# Least number of points of a metal sphere for its radius and gains; chosen. Fewer points do not cover the directions of
+# arrival.
 LEAST_METAL_POINTS = 60
-# A larger deviation of the radius means another object. That of a metal sphere of 125 mm is found within 0.5 %, with
-# antennas misplaced by 1 mm, too (simulated).
+# Largest relative deviation of the measured radius from the given one: a larger one means another object. The radius of
+# a metal sphere of 125 mm is found within 0.5 %, also with antennas misplaced by 1 mm (simulated).
 RADIUS_TOLERANCE = 0.15
 
 
@@ -117,7 +118,10 @@ def check_turns(scans: int, turned_deg: Sequence[float]) -> None:
 
 
 def find_axis(rig: Instrument, axis_mm: tuple[float, float]) -> tuple[float, float]:
-    """Return x and z in the rig frame, metres, of a turntable's axis given from grid's middle and object plane."""
+    """Return x and z of a turntable's axis in the rig frame, metres.
+
+    `axis_mm` is x from the middle of the grid and z from the object plane.
+    """
     optics = make_optics(rig)
     middle_m = mirror_point(optics, rig.geometry.object_distance_mm / 1e3)
     return float(middle_m[0]) + axis_mm[0] / 1e3, float(middle_m[2]) + axis_mm[1] / 1e3
@@ -155,7 +159,7 @@ def check_is_metal(scan: Path, gains: Gains) -> None:
 
 
 def _list_rows(echoes: Echoes) -> list[list[float]]:
-    """Return a row of numbers for each point, as `SphereFile` stores it; three elements of the symmetric `bend`."""
+    """Return a row of numbers for each point, as `SphereFile` stores it; three of them are the symmetric `bend`."""
     bend = echoes.bend
     columns = [*echoes.at_m.T, echoes.path_m, *echoes.slope.T, bend[:, 0, 0], bend[:, 0, 1], bend[:, 1, 1]]
     columns += [echoes.amplitude.real, echoes.amplitude.imag, echoes.amplitude_std, echoes.band_rise]

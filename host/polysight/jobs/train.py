@@ -53,13 +53,13 @@ from polysight.store import TRUTH, open_source, versions
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, make_missing_path_error, quote
 
 EDGE_MM = 9.0
-"""Rim of a known plate that is not used for training: about the resolution in x."""
+"""Width of the rim of a known plate that is not used for training: about the resolution in x."""
 
 
 def load_training_scan(data: Path, config: Path) -> TrainingScan:
     """Return a scan for the library, its patches named by labels or truth.
 
-    `data` is a scan folder of any layout, or a folder of products; `config` the rig file of layouts without one.
+    `data` is a scan folder of any layout, or a folder of products; `config` is the rig file for scans without one.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def check_labelled(data: Path) -> None:
     Raises
     ------
     DataError
-        as :func:`load_training_scan`, as far as the saved image shows it.
+        as :func:`load_training_scan`, for the faults that can be found without the rows.
     """
     scan = find_scan_folder(data) or data
     if not data.is_dir():
@@ -163,7 +163,7 @@ def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
         raise _no_metal_error(saved.folder)
     pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
     materials = analyse(pair, _read_optics(saved), KnownScene(segmentation, metal))
-    # If it is not known, the scan counts as simulated.
+    # If it is not known whether the scan is simulated, it counts as simulated.
     return _add_labels(saved.scan_id, materials, saved.simulated is not False, checked_labels)
 
 
@@ -175,7 +175,7 @@ def _read_optics(saved: ProcessedScan) -> Optics:
     rig = saved.rig
     incidence = saved.quality.incidence
     if rig is not None:
-        # "one": the same incidence angle for all pixels.
+        # With "one", all pixels have the same incidence angle.
         optics = Optics.from_rig(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
     elif saved.quality.given_images and incidence and incidence.one_deg is not None:
         optics = Optics(float(np.radians(incidence.one_deg)))

@@ -1,6 +1,7 @@
 """`polysight doctor --bundle FILE.zip`: findings, versions, logs and manifests for remote help; no raw data, no keys.
 
-docs/how-to/doctor.md and the archive's README.txt list its files. Each is text and passes a `Redactor` first.
+docs/how-to/doctor.md and the archive's README.txt list the files of the archive. All of them are texts, from which a
+`Redactor` removes keys.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ _KEY_BYTES = 64 << 10
 _MANIFEST_BYTES = 64 << 20
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
-# A secret behind its name, in three parts: (1) a name that contains `token`, `password` or the like, or is that of a
-# key; (2) the sign `=` or `:`, perhaps quotes, perhaps `bearer` or `basic`; or (1, 2) the word `bearer` alone; (3) the
-# value: up to the closing quote if it is quoted, else a word. The first group (1, 2) stays, the second (3) is replaced.
+# A secret after its name. The first group of the expression, which is kept, is a name that contains `token`, `password`
+# or the like, or is that of a key, then `=` or `:`, perhaps quotes, perhaps `bearer` or `basic`; or it is only the word
+# `bearer`. The second group, which is replaced, is the value: up to the closing quote if it is quoted, else a word.
 _NAMED_SECRET = re.compile(
     r"""(?ix)((?:[\w-]*(?:secret|token|password|passwd|passphrase|psk)[\w-]*|(?:private|public|curve|api)[_-]?key
     |authorization)["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)
@@ -70,7 +71,7 @@ _PEM = re.compile(r"-----BEGIN [^-]*KEY-----.*?(?:-----END [^-]*KEY-----|\Z)", r
 
 
 class Redactor:
-    """Remove keys from text: those of the key folders by their content, others by name or form."""
+    """Removes keys from text: keys in the files of `folders` by their content, others by their name or form."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         words: set[str] = set()
@@ -79,8 +80,8 @@ class Redactor:
                 for path in sorted(p for p in folder.iterdir() if p.is_file()):
                     with suppress(OSError, DataError):
                         text = read_bounded(path, _KEY_BYTES).decode("utf-8", "replace")
-                        # A key may follow a "=", or have one inside. Shorter words are not keys: removing them would
-                        # make the files unreadable.
+                        # A key may follow a "=", or contain one: the text is split with and without it. Words shorter
+                        # than 16 characters are not keys, and removing them would make the files unreadable.
                         parts = re.split(r"[\s\"']+", text) + re.split(r"[\s\"'=]+", text)
                         words |= {word for word in parts if len(word) >= 16}
         self._words = sorted(words, key=len, reverse=True)

@@ -30,7 +30,7 @@ class Check:
     """One check of a hop.
 
     It is skipped if a check in `needs` failed or was skipped because of a failure, or if a check in `unless` failed.
-    `each_board`: run once for every recorded board.
+    With `each_board` it runs once for every recorded board.
     """
 
     name: str
@@ -66,8 +66,8 @@ CHECKS = (
 
 
 def run_checks(context: CheckContext) -> Iterator[Finding]:
-    """Run every check in order and yield each finding as soon as it is there."""
-    # Check and board that failed or was skipped, and the title of the check that failed.
+    """Run every check in order and yield each finding immediately."""
+    # (check, board) that failed or was skipped, to the title of the check that failed.
     blocked: dict[tuple[str, str], str] = {}
     for check in CHECKS:
         boards: tuple[Board | None, ...] = (None,)
@@ -98,7 +98,8 @@ def _find_failed_prerequisite(check: Check, board: Board | None, blocked: dict[t
         for (name, board_name), failed in blocked.items():
             if name == need and (board is None or board_name in ("", board.name)):
                 return failed
-    # For `unless` a check counts if it failed itself: one that was skipped is in `blocked` with another's title.
+    # For `unless` only a check that failed itself counts: a check that was skipped has the title of another one in
+    # `blocked`.
     return next((name for name in check.unless if blocked.get((name, "")) == name), "")
 
 

@@ -1,7 +1,8 @@
 """Objects that the checks examine: this machine, the options and the rig file, the Pi, card surveys, captured frames.
 
-First the measurements of this machine: clock, network interfaces, disk, and receivers over loopback with every core
-busy. Then the findings of checks and `CheckContext`, which is shared by all of them.
+The first part of this file has the measurements of this machine: clock, network interfaces, disk, and receivers over
+loopback while every core is busy. The second part has the findings of checks, and `CheckContext`, which all checks
+share.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ _STA_UNSYNC = 0x40
 # The ioctl of ethtool (linux/sockios.h), and its command to read the sizes of rings (linux/ethtool.h).
 _SIOCETHTOOL = 0x8946
 _ETHTOOL_GRINGPARAM = 0x10
-# Words of struct ethtool_ringparam after the command: the largest receive ring and the one in use.
+# Indices of two words of struct ethtool_ringparam: the size of the largest receive ring and of the one in use.
 _RX_MAX_WORD = 1
 _RX_WORD = 5
 # Files of sysfs that count packets which an interface dropped.
@@ -64,9 +65,9 @@ _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 
-# A card sends its short last packet two seconds after the last data; half a second more, chosen.
+# Time limit for the short last packet, which a card sends two seconds after the last data; chosen.
 _LAST_PACKET_S = 2.5
-# Between two looks for that packet; chosen.
+# Time between two looks for the last packet; chosen.
 _POLL_S = 0.05
 
 
@@ -86,7 +87,8 @@ def clock_is_synchronised() -> bool | None:
 class NetworkInterface:
     """Settings and drop count of a network interface. None: unknown.
 
-    `ring`, `ring_max`: its receive descriptors and the most it can have. `lost`: packets dropped since it came up.
+    `ring` and `ring_max` are the number of its receive descriptors and the largest possible one, `lost` is the number
+    of packets dropped since it came up.
     """
 
     name: str
@@ -150,7 +152,7 @@ def write_speed(folder: Path) -> float:
         return written_bytes / (time.perf_counter() - started_s)
 
 
-# Duration of the load at each rate; chosen, the whole check takes a few seconds.
+# Duration of the load at each rate; chosen, so that the whole check takes a few seconds.
 _RATE_S = 1.5
 # Time for a receiver that was late to read the packets that wait in its socket; chosen.
 _DRAIN_S = 5.0
@@ -160,7 +162,7 @@ _BUSY_LOOP = "while True: sum(range(100_000))"
 
 @dataclass(frozen=True)
 class LoadResult:
-    """Result at one rate: packets/s of a card requested (`wanted`) and reached; packets sent and lost by all cards."""
+    """Result at one rate: packets/s of each card, requested (`wanted`) and reached; packets sent and lost in all."""
 
     wanted: float
     reached: float
@@ -187,7 +189,7 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
 
     Returns the result for each rate and the receivers' scheduling. Raises DeviceError if a receiver does not start.
     """
-    # Addresses of the loopback device, so that a second doctor or a scan does not use the same.
+    # Draw addresses of the loopback device, so that another doctor or a scan does not use the same ones.
     subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
     boards = [
         msgspec.structs.replace(b, card_address=f"{subnet}.{100 + k}", host_address=f"{subnet}.30")
@@ -210,7 +212,10 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
 
 
 def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
-    """Send `packets` packets to each receiver, as cards that were reset: losses at an earlier rate do not count."""
+    """Send `packets` packets to each receiver, and count those that are lost.
+
+    The packets are those of cards that were reset, so that losses at an earlier rate do not count.
+    """
     for receiver in receivers:
         part = folder / f"{receiver.board.name}.part"
         # The packets hold no frames.
@@ -253,7 +258,7 @@ def error(what: str, why: str, do: str, **facts: Any) -> Finding:
 
 
 def verdict(finding: Finding) -> str:
-    """Return the verdict on a finding, for people and for `--json`: a check that was skipped is a note here."""
+    """Return the verdict on a finding for people and for `--json`; the note of a skipped check is "not checked"."""
     if finding.level == "note":
         return "not checked"
     return finding.level
@@ -280,7 +285,8 @@ def not_checked(what: str, do: str = "") -> Finding:
 class DoctorOptions:
     """Options of the command.
 
-    `out`: folder for scans; `move`: run a row; `pulse`: send SYNC_IN pulses at rest, `bursts` bursts of them.
+    `out` is the folder for scans. With `move` a row is run, with `pulse` `bursts` bursts of SYNC_IN pulses are sent at
+    rest.
     """
 
     config: Path
@@ -292,7 +298,7 @@ class DoctorOptions:
 
 @dataclass(frozen=True)
 class System:
-    """Functions that query this machine, so that tests can replace them. `root`: root of the file system."""
+    """Functions that query this machine, which tests can replace, and the root of the file system, `root`."""
 
     wall_ns: Callable[[], int] = time.time_ns
     clock_is_synchronised: Callable[[], bool | None] = clock_is_synchronised
@@ -406,7 +412,7 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
         states = radars.states()
         captured = {}
         for name, row in rows.items():
-            # Nothing commits this row 0: its file keeps the name of an unfinished one.
+            # The row is never committed, so that its file has the name of an unfinished one.
             payload = np.fromfile(Path(folder) / "raw" / name / f"0000{PART_SUFFIX}", np.uint8)
             chirps = frames * rig.burst.chirps
             words, valid = view_row_words(payload, row.missing, chirps, rig.chirp.samples, len(rig.antennas.rx_mm))

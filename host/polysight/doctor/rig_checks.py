@@ -1,10 +1,10 @@
 """Checks of the rig, from its rig file to the trigger skew. A check is a function of a `CheckContext`.
 
-Host, Pi and stage come first: rig file, clocks, keys, calibration, library, receivers, disk, trigger line. The trigger
-line is checked with a short row in which every point must give an edge. Only this check moves the stage, and only with
-`--move`. Then comes the capture side: capture cards, network, SYNC_IN pulses, radars, level, direct path, trigger skew.
-Level, direct path and trigger skew are checked in `signal_checks.py`. The checks from `check_pulses` on use a few
-bursts captured at rest; armed radars transmit then, for tens of ms.
+Checks of host, Pi and stage come first: rig file, clocks, keys, calibration, library, receivers, disk, trigger line.
+The trigger line is checked with a short row in which every point must give an edge. Only this check moves the stage,
+and only with `--move`. Then come those of the capture: capture cards, network, SYNC_IN pulses, radars, level, direct
+path, trigger skew; the last three are in `signal_checks.py`. `check_pulses` captures a few bursts at rest, in which
+armed radars transmit for tens of ms; the checks after it use these bursts.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ from polysight_shared.sockets import HOST_KEYS, is_loopback
 
 # Least speed of the disk relative to the data rate of a scan; chosen.
 _SPEED_MARGIN = 2.0
-# Difference of the clocks of host and Pi from which on there is a warning; chosen.
+# Difference of the clocks of host and Pi above which there is a warning; chosen.
 _MAX_CLOCK_OFFSET_S = 1.0
-# Difference that is an error: one of the clocks is not set. The host's clock is an error, too, if it is earlier than
-# this program's files by more. Chosen.
+# Difference of the clocks above which there is an error, because one of them is not set; chosen. It is also an error if
+# the host's clock is earlier than this program's files by more than this.
 _CLOCK_LOST_S = 60.0
 _CLOCK_REMEDY = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
 # Hops of the network survey that concern a card.
 _CARD_HOPS = ("host", "route", "link", "card")
-# Least MTU of the interface to a card, which holds a card's packets.
+# Least MTU of the interface to a card: as large as a card's packets.
 _MIN_MTU = 1500
-# Least speed of the interface.
+# Least speed of the interface to a card.
 _MIN_SPEED_MBIT = 1000
-# Least number of its receive descriptors; chosen.
+# Least number of receive descriptors of the interface to a card; chosen.
 _MIN_RING = 512
 
 
@@ -146,7 +146,7 @@ def check_receivers(context: CheckContext) -> Finding:
         losses.append(f"{result.mbit_s:.0f} Mbit/s a card: {loss}")
     observed = f"receivers ({scheduling}) with all cores busy: {'; '.join(losses)}"
     facts = {"held": [vars(result) for result in results], "scheduling": scheduling}
-    # Packets/s, one of the ascending `rates`. Those above that of this rig's cards are for information.
+    # The rate of this rig's cards is one of the ascending `rates`; losses at higher rates are only for information.
     card_rate = 1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)
     rates_of_cards = results[: rates.index(card_rate) + 1]
     if any(result.lost for result in rates_of_cards):
@@ -210,8 +210,9 @@ def check_time(context: CheckContext) -> Finding:
 SIMULATED_NOTE = "simulated wires: no hardware is driven"
 # Points of the row that checks the trigger line; chosen.
 _POINTS = 8
-# Time in which that row must end, and the wait for an event before its end is looked for again; chosen.
+# Time limit of the row that checks the trigger line; chosen.
 _ROW_TIMEOUT_S = 120.0
+# Longest wait for an event of the row before the time limit is checked; chosen.
 _POLL_MS = 100
 
 
@@ -288,7 +289,7 @@ def check_trigger(context: CheckContext) -> Finding:
             "only a moving stage gives trigger edges",
             f"`polysight doctor --move` homes it and runs {_POINTS} points: keep clear of the stage",
         )
-    # A scan may have started since `check_free`, and begin_run would end it.
+    # A scan may have started since `check_free`, and `begin_run` would end that scan.
     context.hello = context.pi.hello()
     if (busy := check_free(context)).level == "error":
         return busy
@@ -319,7 +320,7 @@ def check_trigger(context: CheckContext) -> Finding:
 
 
 def _run_row(context: CheckContext) -> RowFinished:
-    """Run one row of `_POINTS` points in a run of its own and return its end event."""
+    """Run one row of `_POINTS` points as a separate run, and return the event that ends the row."""
     rig = context.rig
     pi = context.pi
     plan = RasterPlan(_POINTS, 1, rig.grid.step_x_mm, rig.grid.step_y_mm)
@@ -351,7 +352,7 @@ def _wait_for_row_end(context: CheckContext) -> RowFinished:
 
 
 def check_stage(context: CheckContext) -> Finding:
-    """Check that no fault is latched and that the sketch has this release."""
+    """Check that the stage has no fault and that its sketch, the firmware, is of this release."""
     status = context.pi.status()
     if status.fault and status.state == "fault":
         explanation = explain(status.fault)
@@ -508,7 +509,10 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
 
 
 def _judge_frames(board: Board, row: RowCapture, observed: str) -> Finding:
-    """Judge if a row's frames came to this machine, by the first fault; `slipped`: only whole frames are missing."""
+    """Judge if all frames of a row came to this machine; return the first fault that is found.
+
+    `row.slipped` means that only whole frames are missing.
+    """
     if row.counts.placed == 0:
         e = explain_silent_radar(board, row)
         return error(e.what, e.why, e.remedy)

@@ -1,7 +1,7 @@
 """Send packets as a capture card does: `python -I send_packets.py CARD CARD_PORT HOST PORT PACKETS RATE BYTES`.
 
-Prints the seconds it took. A program without imports from this package, so that it starts without delay on a busy
-machine.
+It prints the time in seconds that it took. The program imports nothing of this package, so that it starts without delay
+on a busy machine.
 """
 
 import socket
@@ -9,7 +9,8 @@ import struct
 import sys
 import time
 
-# Longest delay that is caught up; chosen: a card, too, catches up no more than its own buffer holds.
+# Longest delay after which packets are sent faster to catch up; chosen. A card, too, catches up only what its buffer
+# holds.
 _MAX_LAG_S = 0.005
 
 
@@ -24,7 +25,7 @@ def main(card: str, card_port: int, host: str, port: int, packets: int, rate: fl
             # Header: sequence number, which begins with 1, and bytes sent before, 48 bits; little-endian.
             sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + bytes(size), (host, port))
             due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
-            # Shorter sleeps take longer than asked for: several packets are sent together instead.
+            # A shorter sleep would take longer than requested: several packets are sent without a pause instead.
             if (early_s := due - time.perf_counter()) > 0.0005:
                 time.sleep(early_s)
         sys.stdout.write(f"{time.perf_counter() - began}\n")

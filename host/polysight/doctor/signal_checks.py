@@ -16,9 +16,9 @@ _MAX_CLIPPED = 0.01
 _MIN_RMS = 4.0
 # Share of chirps in which the direct path must be found; chosen.
 _MIN_DETECTED = 0.9
-# A delay that the 5 ns trigger clock and some ppm of the crystals can cause.
+# Largest delay that the trigger clock of 5 ns and some ppm of the crystals can cause.
 _MAX_DELAY_S = 10e-9
-# Delays of one receiver after the other that are a warning and an error; chosen.
+# Delays of one receiver after the other above which there is a warning, and an error; chosen.
 _SKEW_WARNING_S = 10e-9
 _SKEW_ERROR_S = 20e-9
 # Two trigger clocks of 5 ns give a standard deviation of 2 ns; twice that is a warning.
@@ -30,7 +30,8 @@ def check_level(context: CheckContext, board: Board) -> Finding:
     captured = context.captured.get(board.name)
     if captured is None or not captured.valid.any():
         return not_checked("no complete chirp was captured")
-    # [chirp, sample, I or Q, RX]; I and Q count together in the rms.
+    # The axes are [chirp, sample, I or Q, RX]. The rms of the complex samples of an RX is the root of the sum of the
+    # mean squares of I and Q.
     words = captured.words[captured.valid]
     clipped = int(((words >= FULL_SCALE) | (words <= -FULL_SCALE)).any(axis=(1, 2, 3)).sum())
     rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)
@@ -114,7 +115,8 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             _suggest_start_offset(rig, board, median),
             **facts,
         )
-    # Positive: early, as if the start offset were larger. The crystals' share, known from the drift, is taken off.
+    # A positive value means that the board starts early, as if its start offset were larger. The part that the crystals
+    # cause is known from the drift and was subtracted.
     early_s = -signal.start_delay_s(rig)[0]
     if abs(early_s) > _MAX_DELAY_S:
         start = board.start_offset_hz + early_s * rig.chirp.slope_hz_per_s
@@ -141,7 +143,10 @@ def check_skew(context: CheckContext) -> Finding:
 
 
 def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
-    """Judge the receivers' start times. Relative to the transmitter they are as exact as the start frequencies."""
+    """Judge the difference of the receivers' start times.
+
+    Start times relative to the transmitter are computed from the start frequencies, and only as exact as these.
+    """
     h, v = rig.receivers
     # Mean and standard error of the delay of each board, s.
     delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}

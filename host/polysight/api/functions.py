@@ -1,4 +1,4 @@
-"""Functions on scans: plan one, simulate one, compare two, check the plates of many."""
+"""Functions on scans: `plan` and `simulate` one, `compare` two, `check` the check plates of many."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Plan:
 
     @property
     def warnings(self) -> list[str]:
-        """What to change before scanning."""
+        """Advice on settings that should be changed before the scan."""
         return [expand_paths(f"{warning.where}: {warning.what}") for warning in self.forecast.warnings]
 
     def __str__(self) -> str:
@@ -139,7 +139,7 @@ def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: 
 
 
 def _warn_of_whole_grid(scene: Path) -> None:
-    """Warn the caller of `simulate` if a scene has no grid. A file that cannot be read is left to the simulator."""
+    """Warn the caller of `simulate` if a scene has no grid. The simulator reports a file that cannot be read."""
     with suppress(OSError, ValueError):
         if "grid" not in tomllib.loads(scene.read_text(encoding="utf-8")):
             text = "the scene has no `grid`: all positions of the rig file are simulated, which takes long"
@@ -155,7 +155,8 @@ def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
         On the first scan's pixels: `p_difference` and `permittivity_difference` complex128, `sigmas` (size of the
         difference of P in standard deviations of such differences). On dimension `pair`, of patches at one place:
         `pair_x_mm`, `pair_y_mm`, `first_name`, `second_name`, `pair_difference` (permittivity), `pair_sigmas`.
-        Attributes `notes` (what makes them hard to compare), `compared` (pixels), `significant_share`.
+        Attributes `notes` (reasons why the scans are hard to compare), `compared` (number of pixels),
+        `significant_share`.
 
     Raises
     ------

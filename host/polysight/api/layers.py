@@ -21,8 +21,8 @@ def layer_dataset(
 ) -> xarray.Dataset:
     """Fit the unknown layer of a stack at each patch; errors as `Scan.layers`.
 
-    `bands` are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
-    trusted. A patch without enough data has no fit: not a number in each column.
+    `bands` is the number of sub-bands that are used (None: all if a thickness is fitted), `amplitude_percent` the
+    relative error of |H|. A patch without enough data has no fit, and not a number in each column.
     """
     import xarray
 
@@ -58,7 +58,7 @@ def layer_dataset(
 
 
 def _parse_layer(layer: str | Layer) -> Layer:
-    """Return a layer, parsed if it is a text. Raises ConfigError if that has another form."""
+    """Return a layer; a text is parsed. Raises ConfigError for a text of another form."""
     if isinstance(layer, Layer):
         return layer
     try:

@@ -13,9 +13,9 @@ from polysight.products import ProcessedScan
 from polysight.report import draw_overview, figure_label, font_families
 from polysight.results import CheckResult
 
-# Sizes in inches, chosen by eye. Width of a picture.
+# Width of a picture, in inches as all sizes here, which were chosen by eye.
 _PANEL_IN = 3.8
-# Width of its colour bar and of the axis of the next picture.
+# Width of a colour bar and of the axis of the next picture.
 _BETWEEN_IN = 1.2
 # Height of a picture's title and axis.
 _TITLE_IN = 0.4
@@ -33,14 +33,14 @@ class NotebookFigure(Figure):
 
 
 def plot_scan(scan: ProcessedScan) -> Figure:
-    """Amplitude of H, V and P = H / V in dB, and the materials where the images are relative to metal; axes in mm."""
+    """Draw the amplitudes of H, V and P = H / V in dB, and the materials if the images are relative to metal."""
     rows = 1
     columns = 3
     if scan.metal_referenced:
         # The materials are the fourth picture.
         rows = 2
         columns = 2
-    # A long narrow image becomes neither a line nor a tower (limits chosen by eye).
+    # A picture is at least 0.4 and at most 2 times as high as wide (chosen by eye), also for a long narrow image.
     height_over_width = scan.labels.shape[0] / scan.labels.shape[1]
     height_in = _PANEL_IN * min(2.0, max(0.4, height_over_width))
     size = (columns * (_PANEL_IN + _BETWEEN_IN), rows * (height_in + _TITLE_IN) + _HEAD_IN)
@@ -54,7 +54,7 @@ def plot_scan(scan: ProcessedScan) -> Figure:
 
 
 def plot_control_chart(checked_scans: Sequence[tuple[ProcessedScan, CheckResult]]) -> Figure:
-    """Control chart of the check plates of scans."""
+    """Draw the control chart of the check plates of scans."""
     fig = NotebookFigure(figsize=CHART_IN, dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(fig)
     draw_control_chart(fig, checked_scans)

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 RIG_FILE = Path("instrument.toml")
 Box = tuple[float, float, float, float]
-# The form of a box, for errors.
+# Description of a box in error messages.
 _BOX_FORM = "a box is (x0, y0, x1, y1) in mm from the image's centre, x0 < x1 and y0 < y1"
 # Variables of each patch's permittivity, in the order of the dataset.
 _PERMITTIVITY = (
@@ -98,7 +98,7 @@ def open_scan(
     incidence_deg
         Incidence angle of images of another program; that of their file, or of the rig, if not given.
     fresh
-        Process the rows even where saved products could be used.
+        Process the rows even if saved products could be used.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def find_rig_file(rig: str | os.PathLike[str] | None) -> Path:
 
 
 def _is_box(box: object) -> bool:
-    """True for four corners in order."""
+    """True for four numbers x0, y0, x1, y1 with x0 < x1 and y0 < y1."""
     if not isinstance(box, tuple | list | np.ndarray) or len(box) != 4:
         return False
     x0, y0, x1, y1 = box
@@ -233,19 +233,19 @@ class Scan:
 
     @property
     def scan_id(self) -> str:
-        """Name of the scan; "" when its products do not say."""
+        """Name of the scan; "" if the products do not contain it."""
         return self._origin.scan_id
 
     @property
     def simulated(self) -> bool | None:
-        """True if the data is simulated; None when the products do not say."""
+        """True if the data is simulated; None if the products do not say so or otherwise."""
         return self._origin.simulated
 
     @property
     def verdict(self) -> Verdict | None:
         """Verdict of the result, with reasons; None for products of earlier releases.
 
-        Processes recorded rows where there are no products. Raises as :meth:`image`.
+        Recorded rows are processed if there are no products. Raises as :meth:`image`.
         """
         processed = self._saved or self.read_or_process()
         return processed.verdict
@@ -267,7 +267,7 @@ class Scan:
 
     @property
     def rows(self) -> Rows:
-        """Rows of the scan: `indices`, `planned`, `committed`, `missing`. Raises DataError when products do not say."""
+        """Rows of the scan: `indices`, `planned`, `committed`, `missing`. Raises DataError if products lack them."""
         if self._source is not None:
             return Rows(self._source.plan.rows, tuple(self._source.rows()))
         if self._saved is None or self._saved.rows is None:
@@ -292,7 +292,7 @@ class Scan:
         Raises
         ------
         DataError
-            when no row is whole, no metal is found, or the products hold the other kind and the rows are not there.
+            when no row is whole, no metal is found, or the products have images of the other kind and no rows exist.
         """
         return image_dataset(self.read_or_process(metal_referenced))
 
@@ -344,7 +344,7 @@ class Scan:
             `permittivity` complex128 [y_mm, x_mm], eps' - j eps''; `permittivity_real_standard_error` and
             `permittivity_loss_standard_error`; `mask` bool: True where the scan lights the pixel, the errors are below
             half of the value, and a half space can have it (real part 1, loss 0 or more) within twice its errors.
-            Errors of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than they.
+            Neighbouring pixels have mostly the same error: a mean over a patch is not more certain than a pixel.
             Pixels are corrected for the leakage and the incidence angle that the scene determines, and those of a patch
             for all that is known of it: their median has the patch's permittivity.
 
@@ -405,7 +405,7 @@ class Scan:
     def label(
         self, boxes: Mapping[str, Box], *, metal: str | None = None, specimens: Mapping[str, str] | None = None
     ) -> Path:
-        """Say what lies where, for training; replaces earlier boxes of this scan.
+        """Save the boxes of known materials, for training; earlier boxes of this scan are replaced.
 
         Parameters
         ----------
@@ -415,7 +415,7 @@ class Scan:
         metal
             Box of the metal reference; the one with a metal's name if not given.
         specimens
-            Box to the name of the piece in it, where several scans show the same piece.
+            Box to the name of the piece of material in it, if several scans show the same piece.
 
         Returns
         -------
@@ -437,7 +437,7 @@ class Scan:
                     "see help(polysight.Scan.label)",
                     code=ErrorCode.VALUE_INVALID,
                 )
-        # Images of another program are one file: its folder takes the labels.
+        # Images of another program are one file: the labels are written into its folder.
         labels_folder = label_folder(self.folder if self.folder.is_dir() else self.folder.parent)
         save_labels(labels_folder, self.read_or_process(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
         return labels_folder / LABELS
@@ -467,8 +467,8 @@ class Scan:
         """Permittivity and thickness of the one unknown layer of a stack, on dimension `patch`, with standard errors.
 
         `stack` is typed as for `polysight permittivity --layer`: `scan.layers("sheet,?,0.5-3", "plate,metal")`. `bands`
-        are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
-        trusted. `ambiguous` and `notes` say what the data do not determine. Raises as :meth:`image`, and ConfigError.
+        is the number of sub-bands used (None: all if a thickness is fitted), `amplitude_percent` the relative error of
+        |H|. `ambiguous` and `notes` say what the data do not determine. Raises as :meth:`image`, and ConfigError.
         """
         return layer_dataset(self.read_or_process(True), self.rig.chirp, stack, bands, amplitude_percent)
 
@@ -566,8 +566,8 @@ class Scan:
         """The result if it is saved or was computed already; else None."""
         if self._saved is not None:
             return self._saved
-        # The value of a cached property is in its instance's dict once it was computed. The properties themselves are
-        # not used here, because that would compute them.
+        # The value of a cached property is in the `__dict__` of its object once it was computed. The properties
+        # themselves are not used here, because that would compute them.
         processing = vars(self).get("_processing")
         if processing is None:
             return None

@@ -1,7 +1,7 @@
 """Rows, takes, counts of each board, times and faults of a scan, collected from its manifest and events.
 
-No files and no clocks are read here, so that the same facts always give the same history. A fault becomes a
-finding: a sentence with its likely cause and remedy (`CAUSES`).
+A fact is a record of the manifest. No files and no clocks are read here, so that the same facts and events always give
+the same history. A fault becomes a finding: a sentence with its likely cause and remedy (`CAUSES`).
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     ),
 }
 """Likely cause and remedy by kind of fault. Those of the Pi are in shared/polysight_shared/faults.py."""
-# The last outcome of a row: committed whole, committed with gaps, or rejected and to be taken again.
+# The last outcome of a row: committed whole, committed with gaps ("kept"), or rejected and to be recorded again.
 RowMark = Literal["committed", "kept", "rejected"]
-# Counts of a board's reception that the page adds up over the rows.
+# Attributes of a committed row with counts of a board's reception, which the page adds up over the rows.
 RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
@@ -98,7 +98,7 @@ def make_fault_notice(event: Fault) -> Finding:
     if event.number == PiFault.ABORTED:
         level = "note"
     elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing_faults:
-        # A fault of a burst ends its row, which is taken again.
+        # A fault of a burst ends its row, which is recorded again.
         level = "warning"
     details = {} if event.problem == explanation.problem else {"detail": event.problem}
     problem = f"Fault {event.number} at the Pi: {explanation.problem}"
@@ -112,7 +112,7 @@ def make_fault_notice(event: Fault) -> Finding:
 
 
 def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
-    """Return the likely cause and remedy of a row's faults: those of the first known kind; both "" for none."""
+    """Return the likely cause and remedy of a row's first fault of a known kind; both are "" if there is none."""
     for fault in faults:
         if fault.kind == FaultKind.PI_FAULT and fault.number:
             explanation = explain(fault.number)
@@ -125,7 +125,7 @@ def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
 def make_rejection_notice(
     row: int, take: int, reasons: Sequence[str], faults: Sequence[store.RowFault], utc: str
 ) -> Finding:
-    """Return the notice of a rejected take; one that a person requested is not a fault."""
+    """Return the notice of a rejected take, which is one recording of a row; on request it is not a fault."""
     cause, remedy = _find_cause(faults)
     remedy = remedy or "Nothing: the row is retaken automatically"
     if is_on_request(faults):
@@ -140,15 +140,15 @@ def is_on_request(faults: Sequence[store.RowFault]) -> bool:
 
 
 def _make_row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
-    """Return the notice of a row; the page shows the reasons in full on demand, and the time if it is known."""
+    """Return the notice of a row, whose reasons the page shows on demand, with the time if it is known."""
     return Finding("warning", problem, *why_do, where=f"row {row}", facts={"detail": "; ".join(reasons), "utc": utc})
 
 
 class BoardCounts(msgspec.Struct):
     """Data of one board over the committed rows.
 
-    `retaken` counts takes that were rejected because of it, `masked` positions without a direct path (from the page's
-    synchronisation, 0 here), `counts` the kinds of `RECEPTION`.
+    `retaken` is the number of takes that were rejected because of this board, `counts` has the counts of `RECEPTION`.
+    `masked` is the number of positions without a direct path, which the page's synchronisation fills in; it is 0 here.
     """
 
     name: str
@@ -215,8 +215,8 @@ class ScanHistory:
     notices
         Faults in the order of the facts and events.
     run_started_s, last_commit_s
-        Start of the last run, and time of the last row, seconds since 1970; the latter is later by the length of
-        pauses.
+        Start of the last run, and time of the last row, seconds since 1970. The time of pauses since that row is added
+        to it.
     last_row_utc
         Time of the last row as the manifest has it; "" before.
     rows_since_trouble
@@ -258,7 +258,7 @@ class ScanHistory:
 
     @property
     def takes(self) -> dict[int, int]:
-        """Committed rows and the take that counts, in the order they were committed."""
+        """Committed row to the take that was committed, in the order of the commits."""
         return {row: fact.take for row, fact in self.content.rows.items()}
 
     @property

@@ -24,13 +24,13 @@ from polysight_shared.findings import Finding
 from polysight_shared.raster import WIDTH_US
 
 ELAPSED_PLACEHOLDER = "{since}"
-"""The page puts the elapsed time here."""
-# Number of rows without a fault after which the last fault leaves the headline; chosen.
+"""The page replaces this text by the elapsed time."""
+# Number of rows without a fault after which the headline no longer shows the last fault; chosen.
 RECENT_ROWS = 3
 # A row is late if it takes longer than `LATE_ROWS` usual durations and longer than `LATE_S` seconds; chosen.
 LATE_ROWS = 3.0
 LATE_S = 60.0
-# Residual of the direct path above which a row gives a warning; chosen, 0.004 is usual.
+# Residual phase of the direct path above which a row gives a warning; chosen. 0.004 is usual.
 DIRECT_RAD = 0.1
 # Share of positions without a direct path that gives a warning; chosen.
 MASKED_SHARE = 0.05
@@ -57,7 +57,11 @@ class RowSync(NamedTuple):
 
 
 class Profile(msgspec.Struct, frozen=True):
-    """Range profile of a row: excess path, dB relative to the direct path by board, and the scene's excess paths."""
+    """Range profile of a row against the excess path, which is the path minus the direct path.
+
+    `boards` has the level of each board, dB relative to the direct path; `scene_m` is the range of excess paths that
+    the scene can have.
+    """
 
     row: int
     excess_m: list[float]
@@ -72,7 +76,7 @@ class ShownResults:
     Attributes
     ----------
     revision
-        Number of the replacement, so that pages know new pictures.
+        Number that increases with each replacement, so that pages recognise new pictures.
     rows
         Rows that are in the images, ascending.
     pictures
@@ -101,9 +105,10 @@ class LifeSigns:
     ----------
     life
         What the scan program wrote last; None if it wrote nothing.
-    alive, killed
-        True if it wrote recently or, without `life`, if the manifest grew recently; True if its process has ended and
-        it did not write why.
+    alive
+        True if the program wrote recently or, without `life`, if the manifest grew recently.
+    killed
+        True if the program's process has ended without writing why.
     alive_s
         Time of the last sign of life of a program that is not alive.
     pi_silent_s, pi_limit_s
@@ -142,7 +147,7 @@ class Inputs:
     gone
         True if the folder existed before, and does not now.
     verdict
-        Of the products with materials, see :class:`polysight.page.watch.ProductsTail`.
+        Verdict of the products with materials, see :class:`polysight.page.watch.ProductsTail`.
     """
 
     folder: Path
@@ -159,7 +164,7 @@ class Inputs:
 
 
 class Status(msgspec.Struct, frozen=True):
-    """The headline: one of `STATES` with its words filled in, and the buttons that may be pressed.
+    """The headline of the page: a state of `STATES` with its texts completed, and the buttons that may be pressed.
 
     `ELAPSED_PLACEHOLDER` in `detail` stands for the time elapsed since `since_s` (seconds since 1970).
     """
@@ -195,7 +200,7 @@ class ScanState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PicturesState(msgspec.Struct, frozen=True):
-    """Rows in the pictures, rows that are not in them yet, and by name the ends of each picture's colours."""
+    """Number of rows in the pictures and of rows that wait, and picture to the ends of its colours and their unit."""
 
     revision: int
     rows: int
@@ -208,8 +213,8 @@ class PicturesState(msgspec.Struct, frozen=True):
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """The whole state of a scan; `scan` and what follows are empty where there is no scan yet.
 
-    `control`: it may be controlled. By board and row: `sync` is the residual phase in degrees (nan: unknown), `snr_db`
-    the direct path over its scatter, and `lost` the share of bytes that are missing.
+    With `control` the page may control the scan. `sync`, `snr_db` and `lost` map boards and rows to the residual phase
+    in degrees (nan: unknown), to the level of the direct path over its scatter, and to the share of missing bytes.
     """
 
     status: Status
@@ -342,7 +347,7 @@ def _collect_notices(inputs: Inputs) -> list[Finding]:
     if inputs.failure is not None and not stopped_on_request:
         notices.append(inputs.failure)
     if history is not None:
-        # Why the Pi's events cannot be received.
+        # The error for which the Pi's events cannot be received.
         if inputs.pi.receive_error is not None and history.ended is None:
             notices.append(inputs.pi.receive_error)
         if inputs.shown.problem is not None:
@@ -387,7 +392,7 @@ def make_status(key: str, **words: str | int) -> Status:
     """Return the status of a state of the table, with its texts filled in."""
     state = STATES[key]
     filled = {"since": ELAPSED_PLACEHOLDER, **words}
-    # A line that can be pasted into a shell.
+    # In a command that a user may paste into a shell, the folder is quoted.
     pasted = {**filled, "folder": quote(str(words.get("folder", "")))}
     return Status(
         key=key,
@@ -413,7 +418,7 @@ def make_status_of_finding(key: str, finding: Finding | None, **words: str | int
 
 
 def judge(inputs: Inputs) -> Status:
-    """Return the status of a scan: that of its worst condition."""
+    """Return the status of a scan, which describes its worst condition."""
     history = inputs.history
     folder = str(inputs.folder)
     if inputs.gone:
@@ -422,7 +427,7 @@ def judge(inputs: Inputs) -> Status:
         return _judge_start(inputs)
     if history.ended is not None:
         return _judge_end(inputs, history, history.ended)
-    # In order of weight: the first condition that applies is the worst.
+    # The conditions are in the order of their weight: the first one that applies is the worst.
     status = _judge_trouble(inputs, history) or _judge_rig(inputs, history) or _judge_rows(inputs, history)
     if status is not None:
         return status
@@ -450,7 +455,7 @@ def _judge_start(inputs: Inputs) -> Status:
 
 
 def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
-    """True unless the scan runs or materials are computed: products of an earlier run may lie there then."""
+    """True unless the scan runs or its materials are computed: then the products may be those of an earlier run."""
     life = inputs.signs.life
     computing = life is not None and life.doing == "materials" and inputs.signs.alive
     return history.ended is not None and not computing
@@ -472,7 +477,7 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
             return make_status("processing")
         return make_status("resuming", safe=safe)
     if ended.exit_status == "success" and len(history.takes) == history.plan.rows:
-        # Between the last row and materials; whether it is processed is not known yet.
+        # The program still runs after the last row: whether it will process the scan is not known yet.
         if inputs.verdict is None and inputs.signs.life is not None and inputs.signs.alive:
             return make_status("finishing")
         return _judge_result(inputs, all_safe)
@@ -518,7 +523,7 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _is_connecting(inputs: Inputs, history: ScanHistory) -> bool:
-    """True if the program that a page started does not take commands yet: it has written no sign of life of its own."""
+    """True if the program that a page started does not accept commands yet, because it wrote no sign of life so far."""
     signs = inputs.signs
     program = inputs.program
     if program is None or program.kind != "scan" or not program.running:
@@ -584,7 +589,7 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
 def _find_late_since_s(history: ScanHistory, signs: LifeSigns) -> float:
     """Return when the last row ended, if that is much longer ago than a row takes; otherwise 0.
 
-    The first row alone is not a measure.
+    The duration of the first row alone is not used, because it is not a measure of the others.
     """
     if history.row_seconds is None:
         return 0.0

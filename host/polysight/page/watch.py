@@ -51,14 +51,15 @@ from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import create_observer
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Range profiles: points of the Fourier transform, points that are shown, and the lowest level; chosen.
+# Number of points of the Fourier transform of a range profile, number of its points that are shown, and its lowest
+# level; chosen.
 FFT_POINTS = 2048
 PROFILE_POINTS = 240
 PROFILE_FLOOR_DB = -70.0
 # Excess path that a profile shows before the direct path and beyond the scene; chosen.
 BEFORE_M = 0.25
 BEYOND_M = 0.35
-# Shortest time between two pictures, while many rows are caught up with; chosen.
+# Shortest time between two pictures while several rows wait to be processed; chosen.
 PICTURE_INTERVAL_S = 0.5
 # Time between two looks for committed rows; chosen.
 POLL_S = 0.1
@@ -69,7 +70,7 @@ HEAD_BYTES = 256
 TURN_S = 0.2
 # Timeout of waiting for an event of the Pi; chosen.
 LISTEN_MS = 200
-# Faults of the current row that are kept for the page; chosen.
+# Number of faults of the current row that are kept for the page; chosen.
 MAX_FAULTS = 20
 # Longest time from a manifest's first line to the first sign of life of its program; chosen.
 GRACE_S = 6.0
@@ -80,7 +81,7 @@ UNATTENDED_ROWS = 3.0
 
 
 def scene_m(rig: Instrument) -> tuple[float, float]:
-    """Return the excess paths that the scene can have: nearest and farthest, metres."""
+    """Return the smallest and the largest excess path that the scene can have, metres."""
     antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
     return find_scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig))
 
@@ -88,9 +89,10 @@ def scene_m(rig: Instrument) -> tuple[float, float]:
 def compute_range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean power over RX and positions against excess path, relative to the direct path at 0.
 
-    An echo of excess path d is `exp(+j 2 pi f d / c)` (sync/chain.py), so a Fourier transform along the linear
-    samples, Hann-windowed, has it at bin `d N df / c` (N is `FFT_POINTS`), counted modulo N for d < 0. Returns dB,
-    float64 [n] as `excess_m`, no less than `PROFILE_FLOOR_DB`, and that where no position is valid.
+    An echo with the excess path d is exp(+j 2 pi f d / c) (sync/chain.py). A Fourier transform of N = `FFT_POINTS`
+    points over the linear samples, which have the spacing df and a Hann window, has this echo at the bin d N df / c,
+    modulo N if d < 0. Returns dB, float64 [n] as `excess_m`, at least `PROFILE_FLOOR_DB`, which is also returned if no
+    position is valid.
     """
     first, last = (chirp.first_sample_hz + chirp.hz_per_sample * n for n in chirp.linear_samples)
     linear = (row.sweep_hz >= first) & (row.sweep_hz < last)
@@ -112,7 +114,7 @@ class RowViewer:
     def __init__(self, path: Path, content: Manifest) -> None:
         self.shown = ShownResults()
         self._source = ScanFolder(path, content)
-        # Rows to show and the take of each, those in the images, and those that failed.
+        # Row to its take: rows to show, rows that are in the images, and rows that failed.
         self._to_show: dict[int, int] = {}
         self._done: dict[int, int] = {}
         self._failed: dict[int, int] = {}
@@ -154,7 +156,7 @@ class RowViewer:
                 continue
             row, take = waiting[0]
             try:
-                # "read": samples that processing kept are used, and none are written.
+                # With "read", samples that processing has kept are used, and none are written.
                 pipeline = pipeline or Pipeline(self._source, live=True, samples="read")
                 self._add(pipeline, row, take, draws=len(waiting) == 1)
             except PolysightError as e:
@@ -183,7 +185,7 @@ class RowViewer:
             self._drawn_at = time.monotonic()
 
     def _compute_profile(self, pipeline: Pipeline, row: int) -> Profile:
-        """Return the profile of a row, synchronised again: kept samples hold the scene, but not the direct path."""
+        """Return the profile of a row, which is synchronised again: kept samples do not contain the direct path."""
         rig = pipeline.source.instrument
         nearest, farthest = scene_m(rig)
         excess = np.linspace(-BEFORE_M, farthest + BEYOND_M, PROFILE_POINTS)
@@ -411,9 +413,9 @@ class Versioned(NamedTuple):
 class Watch:
     """Follows a scan folder, which may not exist yet, in a thread of its own, and writes nothing.
 
-    `control`: pages may offer to pause and stop the scan. `lapse_s` is the timeout of the scan program's signs of life.
-    Pages are sent `state` (a `Snapshot`: status, rows, boards) and `motion` (place of the stage, point, time left) as
-    JSON; `shown` has the pictures.
+    With `control` pages may offer to pause and stop the scan. `lapse_s` is the timeout of the scan program's signs of
+    life. `state` (a `Snapshot`: status, rows, boards) and `motion` (place of the stage, point, time left) are sent to
+    pages as JSON; `shown` has the pictures.
     """
 
     def __init__(self, folder: Path, control: bool = False, lapse_s: float = LAPSE_S) -> None:
@@ -493,14 +495,15 @@ class Watch:
     def _read(self) -> None:
         """Read what was appended to the files."""
         facts = self._manifest.look()
-        # A folder that disappeared may be renamed back; a new one of its name has no manifest yet.
+        # A missing folder may come back under its name, if it was renamed for a while. A folder without a manifest is a
+        # new one.
         is_new_folder = self._history is not None and self.folder.is_dir() and not self._manifest.file.path.exists()
         if self._manifest.file.replaced or is_new_folder:
             self._close_parts()
             self._begin()
             self.shown = ShownResults()
             facts = self._manifest.look()
-        # Content that is read at the first look may be old.
+        # Content that is read at the first look may be old: it is not a sign that the scan's program is alive.
         if facts and self._looked:
             self._grown_at = time.monotonic()
         self._looked = True
@@ -539,8 +542,8 @@ class Watch:
         life = read_life(self.folder)
         life_s = None if life is None else life.written_s
         if life_s is not None and life_s != self._life_s:
-            # The first sign may be old: its age is the difference of two clocks. A later one is new when it changes,
-            # whatever the file system's clock says.
+            # The first sign of life that is read here may be old: its age is the difference of two clocks. Each later
+            # one is new when it is found, even if the file system's clock differs from this one.
             age_s = 0.0
             if self._life_s is None:
                 age_s = max(0.0, wall_s - life_s)
@@ -555,7 +558,7 @@ class Watch:
             is_alive = now - self._grown_at < patience_s
         else:
             is_alive = not killed and now - self._life_at < self._lapse_s
-        # Unix time of the last sign of life; not needed while there are some.
+        # Time of the last sign of life, seconds since 1970; it is shown only if the program is not alive.
         alive_s = 0
         if not is_alive:
             alive_s = round(life_s or self._manifest.file.modified_s)

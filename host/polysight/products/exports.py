@@ -85,7 +85,7 @@ def provenance(scan: ProcessedScan) -> dict[str, Any]:
     simulated = "unknown" if scan.simulated is None else scan.simulated
     metal = UNREFERENCED
     if scan.materials is not None:
-        # Products of earlier releases do not say how.
+        # Products of earlier releases do not say how the metal reference was found.
         metal = "given"
         if scan.materials.metal_reference:
             metal = scan.materials.metal_reference.how
@@ -415,7 +415,7 @@ def write_netcdf(path: str | os.PathLike[str], dataset: xarray.Dataset) -> None:
 
 
 def pack_netcdf(dataset: xarray.Dataset) -> bytes:
-    """Return the content of a NetCDF 4 file; complex variables become two real ones, True and False 1 and 0.
+    """Return the content of a NetCDF 4 file, converted as in :func:`write_netcdf`.
 
     Raises
     ------
@@ -464,7 +464,7 @@ def read_netcdf(path: str | os.PathLike[str]) -> xarray.Dataset:
 
 
 def _check_hdf5(path: Path) -> None:
-    """Raise DataError if arrays lie in other files or are too large, before anything is read. Raises OSError."""
+    """Raise DataError if a file's arrays are in other files, or too large to be read. Raises OSError."""
     import h5py
 
     sizes: list[int] = []
@@ -603,7 +603,7 @@ def _make_matlab_name(key: str) -> str:
     return name[:_LONGEST_NAME]
 
 
-# Ending of the folder's name that exports are written to by default.
+# End of the name of the folder into which exports are written by default.
 _FOLDER = "export"
 
 

@@ -1,11 +1,11 @@
 """Maps of a processed scan: H, V and P as they are drawn, and the permittivity of each pixel with its errors.
 
-Figures of reports and pictures of pages draw the same values. Amplitudes are in dB, phases in degrees. A phase or a
-ratio means nothing where a channel holds only noise: there its pixels fade out.
+Figures of reports and pictures of pages draw the same values. Amplitudes are in dB, phases in degrees. If a channel has
+only noise at a pixel, its phase and the ratio mean nothing there, and the pixel is transparent.
 
-For permittivities: the pixels of image.npz are relative to metal and free of known leakage. What the scene shows beyond
-that is in the error budget and in the patches: leakage and incidence angle apply to all pixels, drift, tilt and the
-error of the metal reference are known where a patch is.
+For permittivities, the pixels of image.npz are relative to metal, and the leakage that was known before the scan is
+removed from them. The scene determines more: the leakage and the incidence angle in the error budget apply to all
+pixels; drift, tilt and the error of the metal reference are known only for patches.
 """
 
 from __future__ import annotations
@@ -34,26 +34,28 @@ from polysight.results import ErrorBudget, LeakageError, Pair
 
 Real = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-# Lower and upper end.
+# Values at the lower and the upper end of the colours.
 Limits = tuple[float, float]
 
 # A map shows one quantity of one channel.
 CHANNELS = ("h", "v", "p")
 QUANTITIES = ("amplitude", "phase")
-# Amplitudes are shown down to this far below the upper end of their colours; chosen.
+# Range of the colours of amplitudes, below their upper end; chosen.
 AMPLITUDE_RANGE_DB = 35.0
-# Single bright pixels shall neither darken the rest of an amplitude nor fade a phase. Both are chosen.
+# Percentiles that stand for the brightest pixels: for the upper end of an amplitude's colours, and for the opacity of a
+# phase. Both are chosen below 100, so that single bright pixels neither darken the others nor make them transparent.
 BRIGHT_PERCENTILE = 99.8
 REFERENCE_PERCENTILE = 99.5
-# Phases and ratios begin to show this far below the brightest pixels, and are opaque from the second level on; chosen.
+# Levels relative to the brightest pixels: below the first one phases and ratios are transparent, above the second one
+# they are opaque; chosen.
 FAINT_DB = -26.0
 CLEAR_DB = -18.0
-# |P| of an image without patches: percentiles of the opaque pixels, and what is shown if there are none; chosen.
+# Range of |P| of an image without patches: percentiles of the opaque pixels, and a range if there are none; chosen.
 RATIO_PERCENTILES = (5.0, 95.0)
 NO_RATIOS_DB = (0.0, 20.0)
-# Narrowest range of |P|, chosen: below it noise would look like a difference.
+# Narrowest range of |P|; chosen. With a narrower one noise would look like a difference.
 LEAST_RATIO_RANGE_DB = 6.0
-# Smaller amplitudes have the level of this one, so that zero has a level.
+# Smallest amplitude of which a level is computed: smaller ones, and zero, get its level.
 LEAST_AMPLITUDE = 1e-12
 
 
@@ -107,7 +109,7 @@ def map_images(
     top_db
         Upper end of |H| and |V|; None: that of the brightest pixels.
     patches_db
-        |P| of patches: the range of |P| holds them. Empty: it is that of the bright pixels.
+        |P| of patches, which the range of |P| includes. If it is empty, the range is that of the bright pixels.
     """
     if channel == "p":
         values = ratio(images.h, images.v) if images.p is None else images.p
@@ -139,8 +141,8 @@ def map_scan(scan: ProcessedScan, channel: str, quantity: str) -> MapValues:
 def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[float]) -> Limits:
     """Return the range of |P| in whole dB: that of the patches if there are any, else of the opaque pixels.
 
-    It has a decibel to spare at both ends, and begins below metal's 0 dB, over which |P| of surfaces lies; if all
-    values are far below, 0 dB is beyond its upper end.
+    It is wider than the values by a decibel at both ends, and begins below the 0 dB of metal, because |P| of surfaces
+    is above. If all values are far below 0 dB, the range ends below 0 dB.
     """
     if patches_db:
         low = min(patches_db)
@@ -156,9 +158,9 @@ def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[flo
 
 # --- permittivity of each pixel ---
 
-# Largest error of a permittivity that says something, relative to its size; chosen.
+# Largest error, relative to its size, of a permittivity that is shown; chosen.
 LARGEST_ERROR = 0.5
-# Standard errors by which a permittivity may lie beyond what a half space can have; chosen.
+# Number of standard errors by which a permittivity may be outside of the values of a half space; chosen.
 LARGEST_DEVIATION = 2.0
 # Step for the derivative by the incidence angle; chosen.
 _ANGLE_STEP_RAD = 1e-6
@@ -192,10 +194,9 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
     The leakage and the incidence angle of the error budget are applied to every pixel. The pixels of a patch are moved
     together, in V / H, so that their median has the patch's permittivity, and none is more certain than the patch.
 
-    The permittivity is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle
-    adds its own.
-    `Images.p_sigma`, the standard deviation of P, holds noise, metal reference, and the remaining leakage.
-    Without an incidence angle nothing is known.
+    The permittivity is analytic in 1 / P, so that the error of P adds the same variance to both parts; the error of the
+    angle adds a variance to each part. `Images.p_sigma`, the standard deviation of P, includes noise, metal reference,
+    and the remaining leakage. Without an incidence angle all values are not numbers.
     """
     budget = None
     if scan.materials is not None:
@@ -282,7 +283,7 @@ def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tu
             continue
         is_of_patch = scan.labels == patch.label
         pixels = is_of_patch & np.isfinite(inverse)
-        # Only the known interiors of patches count: pixels at the edges contain echoes of the neighbours, too.
+        # If the interiors of patches are known, only they are used: pixels at the edges contain echoes of neighbours.
         if scan.interior is not None:
             pixels &= scan.interior
         if not pixels.any():

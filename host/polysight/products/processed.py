@@ -1,8 +1,8 @@
 """One processed scan: images, patches, quality, verdict and provenance, just computed or read from its folder.
 
-The files are image.npz, materials.json, quality.json and scan.json, written atomically. `find_products` finds a folder
-of products, `ProcessedScan` reads its files, without names and permittivities if the verdict is "no result"
-(`ScanMaterials`). Formats: docs/spec/products.md.
+The files are image.npz, materials.json, quality.json and scan.json, which are written atomically; docs/spec/products.md
+has their formats. `find_products` finds a folder of products, and `ProcessedScan` reads its files. If the verdict is
+"no result", it leaves out names and permittivities (`ScanMaterials`).
 """
 
 from __future__ import annotations
@@ -76,7 +76,10 @@ _OPTIONAL = ("p_sigma", "raised_m")
 
 
 class PlatesNamed(NamedTuple):
-    """Number of `plates` of a scene, and of those named right; `strange` others are rightly called unknown."""
+    """Result of naming the plates of a scene: `right` of `plates` plates were named right.
+
+    `strange` further plates are of materials that the library does not contain, and were rightly called unknown.
+    """
 
     right: int
     plates: int
@@ -112,7 +115,7 @@ def write_image(path: Path, images: Images, simulated: bool = False) -> None:
     buffer = io.BytesIO()
     arrays_to_store: dict[str, Any] = {name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()}
     if simulated:
-        # Without this mark, images that are taken from this file as given ones would count as measured.
+        # Without this mark the images would count as measured, if a user gives this file as images of another program.
         arrays_to_store["simulated"] = np.bool_(True)
     np.savez_compressed(buffer, **arrays_to_store)
     write_atomically(path, buffer.getvalue())
@@ -207,7 +210,7 @@ class ComputedContent(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class ProcessedScan:
-    """The result of processing one scan. What is not given is read from the folder, at first use.
+    """The result of processing one scan. Values that were not given to `from_results` are read from the folder.
 
     Reading raises DataError if a file is damaged. Names and permittivities are withheld where the verdict is "no
     result", see :class:`polysight.results.ScanMaterials`.
@@ -228,7 +231,7 @@ class ProcessedScan:
         folder.
         """
         scan = cls(folder)
-        # Python looks for a value here before it calls a cached property.
+        # A cached property whose value is in the `__dict__` is not computed.
         vars(scan).update({"materials": None, **content})
         if not scan.judged:
             vars(scan).update(plates=(), pixel_names={}, expected_accuracy=None)
@@ -335,9 +338,9 @@ class ProcessedScan:
     def named_plates(self) -> PlatesNamed | None:
         """Count the plates of the scene by their names, also those that were not found; None without truth or names.
 
-        Only plates with a permittivity count: metal is the reference, not a result, and strips and stacks of layers
-        have none; a scene without such plates has no count. What the library does not hold, and was called unknown, is
-        neither right nor wrong.
+        Only plates with a permittivity are counted: metal is the reference and not a result, and strips and stacks of
+        layers have no permittivity. A scene without such plates has no count. A plate whose material is not in the
+        library, and which was called unknown, is neither right nor wrong.
         """
         plates = sum(plate.permittivity is not None for plate in self.plates)
         if not plates or not any(patch.name for patch in self.segments):
@@ -381,7 +384,7 @@ class ProcessedScan:
 
     @property
     def stamped(self) -> bool:
-        """True if pictures and pages are stamped SIMULATED: also where it is not known."""
+        """True if pictures and pages get the stamp SIMULATED: unless the data is known to be measured."""
         return self.simulated is not False
 
     @property

@@ -1,9 +1,10 @@
 """Figures of a report and of single commands: amplitude and phase of H, V and P in millimetres, and permittivities.
 
-Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight); the phase of P,
-where its colours span only a part of the circle, cividis. *Patches* (`ProcessedScan.segments`) are the regions that the
-processing found, *plates* the true ones of a simulated scan. `label_figure` shows the boxes of a label file,
-`draw_focus_figure` a sweep over depth, `surface_figure` surfaces from three sides.
+The colour map of amplitudes is perceptually uniform and safe for colour-blind readers (cividis), that of phases is
+cyclic (twilight). The phase of P has cividis if its colours span only a part of the circle. *Patches*
+(`ProcessedScan.segments`) are the regions that the processing found, *plates* the true ones of a simulated scan.
+`label_figure` shows the boxes of a label file, `draw_focus_figure` a sweep over depth, `surface_figure` surfaces from
+three sides.
 """
 
 from __future__ import annotations
@@ -40,11 +41,12 @@ VIEWS = (
     ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),
     ((0, 2), "From above", ("x (mm)", "z (mm), away from the rig")),
 )
-# Number of normals that are drawn in a view of a surface, up to twice as many; more would hide the points. Chosen.
+# Number of normals that are drawn in a view of a surface; chosen. There may be up to twice as many, because every k-th
+# point has one; more would hide the points.
 NORMALS_SHOWN = 60
 # Length of a drawn normal; chosen.
 NORMAL_MM = 12.0
-# Most segments that are described below a surface; chosen.
+# Largest number of segments that are described below a surface; chosen.
 MAX_LINES = 8
 # Colour of points without a permittivity.
 NO_PERMITTIVITY = "#9aa3ad"
@@ -57,18 +59,19 @@ FIGURES: dict[str, str] = {
     "phase_v": "Phase V",
     "phase_p": "Phase of P = H / V",
 }
-# Pixels further out than this share of a patch's box belong to its edge, where two materials mix; chosen.
+# The inner part of a patch's box, as a share of its width and of its height; chosen. Pixels further out are at its
+# edge, where two materials mix.
 _INSIDE_SHARE = 0.6
 # The colours of the phase of P span these percentiles of the pixels' phases; chosen.
 _PERCENTILES = (5.0, 95.0)
-# They span at least this range; chosen.
+# The colours of the phase of P span at least this range; chosen.
 _LEAST_DEG = 20.0
-# A wider range counts as the whole circle; chosen.
+# A range of the phase of P that is wider than this counts as the whole circle; chosen.
 _MAX_DEG = 300.0
 # Outlines of boxes drawn by hand.
 _METAL_BOX = "#ff9e3d"
 _OTHER_BOX = "#ffffff"
-# Levels below the peak that the images of `focus` show; chosen.
+# Range of levels below the peak that the images of `focus` show; chosen.
 _FOCUS_RANGE_DB = 30.0
 # Room on both sides of patches and plates, below them, and above them, where their names are written; chosen by eye.
 _SIDE_ROOM_MM = 20
@@ -76,7 +79,7 @@ _LOWER_ROOM_MM = 12
 _UPPER_ROOM_MM = 24
 # Share of a map's height that a label needs; chosen by eye.
 _LABEL_HEIGHT = 0.05
-# Share of a map's width between two maps: a colour bar's and an axis's numbers stand there.
+# Gap between two maps, as a share of a map's width: the numbers of a colour bar and of an axis are written there.
 _GAP_SHARE = 0.26
 # Positions with data are light, masked ones dark, so that the map is readable without colour.
 _POSITION_COLOURS = ("#dfe5ec", "#882255")
@@ -85,9 +88,9 @@ _POSITION_COLOURS = ("#dfe5ec", "#882255")
 def find_phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     """Return the range of the phase of P inside the judged patches, degrees.
 
-    None if it is nearly the whole circle, or without pixels of patches. The metal reference, 0 degrees by definition,
-    does not count; if no other patch was judged, all patches do. The range is taken around the circular mean, so that
-    values on both sides of 180 degrees lie side by side: limits may pass 180.
+    None if it is nearly the whole circle, or if there are no pixels of patches. The metal reference, whose phase is 0
+    by definition, is left out; if no other patch was judged, all patches are used. The range lies around the circular
+    mean, so that values on both sides of 180 degrees are next to each other: a limit may be beyond 180.
     """
     inner_pixels: list[npt.NDArray] = []
     judged_patches = [patch for patch in scan.segments if patch.refused is None and not patch.metal_reference]
@@ -114,9 +117,10 @@ def find_phase_limits_deg(scan: ProcessedScan) -> Limits | None:
 
 
 def _name_amplitude_unit(scan: ProcessedScan) -> str:
-    """Return the unit of amplitudes, which says what 0 dB is: the metal, or a reference that may not be metal.
+    """Return the unit of amplitudes, which says what 0 dB is: the metal or, without a result, the reference.
 
-    The latter where the scan has no result (`judged`). Without a reference 0 dB means nothing.
+    If the verdict is "no result" (`judged` is false), the reference may not be metal. Without a reference 0 dB means
+    nothing.
     """
     if not scan.metal_referenced:
         return "dB"
@@ -139,7 +143,7 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
         colours = "cividis" if phase_deg else "twilight"
     if quantity == "phase" and phase_deg is not None:
         limits = phase_deg
-        # Each phase is turned by whole circles to within 180 degrees of the limits' middle.
+        # Add whole circles to each phase, so that it is within 180 degrees of the middle of the limits.
         middle = sum(phase_deg) / 2
         numbers = (numbers - middle + 180) % 360 - 180 + middle
     image = ax.imshow(
@@ -211,7 +215,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[sty
             ax.add_patch(
                 style.make_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
             )
-        # Results may lack the outline: a judged patch is then shown by its pixels alone, another by its box.
+        # Results may lack the outline. Then a judged patch is shown only by its pixels, and another one by its box.
         if patch.outline_mm or patch.refused is not None:
             ax.add_patch(style.make_outline(patch, fill=False, edgecolor=style.INK, linewidth=0.9))
         name = style.patch_label(patch)
@@ -222,7 +226,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[sty
             second_line = f"{100 * patch.confidence:.0f} %"
         text = style.write_label(ax, patch.centre_x_mm, y1 + 0.5, name, size, above=True)
         _keep_inside(ax, text, y1)
-        # Two lines above the patch would reach the next one.
+        # The second line is written inside the patch: two lines above it would reach the next patch.
         style.write_label(ax, patch.centre_x_mm, y0 + 1.0, second_line, size, above=True)
         labels.append(style.MapLabel(text, str(patch.label), name, style.patch_colour(patch, colours)))
     return labels
@@ -236,7 +240,7 @@ def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
 
 
 def _crop_to_plates(ax: Axes, scan: ProcessedScan) -> None:
-    """Set limits around patches and plates: square where the image has room, the same for map and truth."""
+    """Set limits around patches and plates, the same for map and truth: a square if the image is large enough."""
     boxes = [patch.box_mm for patch in scan.segments] + [plate.box_mm for plate in scan.plates]
     left, right, bottom, top = scan.extent_mm
     if boxes:
@@ -281,7 +285,10 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[style.M
 def draw_map_figure(
     scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[style.MapLabel]], title: str
 ) -> bytes:
-    """Return a PNG of a material map or of the truth. If names lack room all become numbers, with a legend below."""
+    """Return a PNG of a material map or of the truth.
+
+    If names do not fit, all of them are replaced by numbers, with a legend below.
+    """
     fig = style.make_figure(4.6, 4.6, style.RIGHT_IN)
     ax = fig.add_subplot()
     labels = draw(ax, scan)
@@ -387,7 +394,7 @@ def find_masked_positions(scan: ProcessedScan) -> dict[str, npt.NDArray[np.bool_
 
 
 def _mask(board: BoardQuality, plan: RasterPlan) -> npt.NDArray[np.bool_]:
-    """Return the masked positions of a board, bool [row, column], those of rows that were not recorded among them."""
+    """Return the masked positions of a board, bool [row, column], including those of rows that were not recorded."""
     mask = np.zeros((plan.rows, plan.columns), np.bool_)
     for row, runs in (board.masked_columns or {}).items():
         for start, stop in runs:
@@ -423,7 +430,7 @@ def draw_coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bo
 def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_labels: bool = False) -> None:
     """Draw amplitude H, V, P with colour bars on the first three axes, and the materials on the fourth if given.
 
-    `bar_labels`: the bars have their unit, too.
+    With `bar_labels` the unit is written at the colour bars.
     """
     for ax, key, title in zip(
         axes[:3],
@@ -556,7 +563,8 @@ def surface_figure(surface: Surface) -> bytes:
     colours = colormaps["viridis"].with_extremes(bad=NO_PERMITTIVITY)
     coloured = None
     for ax, ((across, up), title, (label_x, label_y)) in zip(panels, VIEWS, strict=True):
-        # Nearer points are drawn last: the rig looks along +z, the other two views look against x and y.
+        # Nearer points are drawn last. The rig looks along +z, the other two views look against x and y. The axes 0, 1
+        # and 2 of a view add to 3: the depth is the one that is not drawn.
         depth_axis = 3 - across - up
         depth = points_mm[:, depth_axis]
         order = np.argsort(-depth if depth_axis == DEPTH_AXIS else depth, kind="stable")

@@ -1,7 +1,8 @@
 """Write `report.html`, one self-contained page with inline images, and the same figures as files.
 
-Tables are plain dicts (caption, head, rows) for the page's template. Of a patch, a figure is a number: the columns are
-those that the type of the scan's patches (`polysight.results.PatchFigures` or a subclass) declares with a title.
+Tables are plain dicts (caption, head, rows) for the page's template. The table of patches has a column for each figure
+(a number of a patch) that the type of the patches, `polysight.results.PatchFigures` or a subclass, declares with a
+title.
 """
 
 from __future__ import annotations
@@ -66,9 +67,9 @@ ALTERNATIVE_TEXTS = {
     "coverage": "Masked positions",
     "surface": "Surfaces from three sides",
 }
-# Figures of a board that are shown in another table or in a map, or that only programs read.
+# Keys of a board's quality that are shown in another table or in a map, or that only programs read.
 _NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
-# Last word of a key to the unit that it means.
+# Last word of a key to the unit of its value.
 UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
 
@@ -86,7 +87,7 @@ def write_report(out_dir: Path, scan: ProcessedScan) -> Path:
 
 @cache
 def _load_template() -> Template:
-    """Return the page's template: compiling it takes 0.1 CPU s, once for all reports of a program."""
+    """Return the page's template. It is compiled once for all reports of a program, which takes 0.1 s."""
     environment = Environment(
         loader=PackageLoader("polysight.report", "."),
         autoescape=select_autoescape(["html"]),
@@ -150,7 +151,7 @@ def _list_notes(scan: ProcessedScan) -> list[str]:
     notes = [NOT_ON_HARDWARE]
     if scan.quality.coverage and scan.quality.coverage.damage:
         notes.insert(0, scan.quality.coverage.damage)
-    # Without a model of the materials, `library` is the sentence that says why.
+    # If nothing was named, `model` is None, and `library` is the sentence that says why.
     if scan.materials is not None and scan.materials.model is None and scan.materials.library:
         notes.append(scan.materials.library)
     return notes
@@ -196,13 +197,13 @@ def _select_shown_figures(scan: ProcessedScan) -> list[Figure]:
 def _mark_commands(words: str) -> Markup:
     """Escape text and mark `commands` in it as code."""
     parts = [escape(part) for part in words.split("`")]
-    # Every second part stood between two backquotes.
+    # Every second part was between two backquotes.
     parts[1::2] = [Markup("<code>{}</code>").format(part) for part in parts[1::2]]
     return Markup("").join(parts)
 
 
 def _list_remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """Return the measurements that would shrink the errors, each with the patches that it helps."""
+    """Return the measurements that would reduce the errors, each with the patches whose errors it would reduce."""
     patches_by_remedy: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row["do"]:
@@ -233,9 +234,10 @@ def _write_lead(scan: ProcessedScan) -> str:
 def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
     """Format one line of the materials table: key of the template to text.
 
-    `truth`, `true_real`, `true_loss` and `error` are of the true plate there; `right`: the name is the true one;
-    `strange`: called unknown, and truly not in the library. `votes` is the confidence, `drawn_as` the name of the box
-    that the operator drew, `do` the measurement that would shrink the error most.
+    `truth`, `true_real`, `true_loss` and `error` come from the true plate at this place. `right` is true if the name is
+    the true one, `strange` if the patch was rightly called unknown, because the library does not contain its material.
+    `votes` is the confidence, `drawn_as` the name of the box that the operator drew, `do` the measurement that would
+    reduce the error most.
     """
     truth = patch.truth
     estimate = patch.permittivity
@@ -271,7 +273,6 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
         row["real"] = "metal-like"
     if truth is not None:
         row["truth"] = truth.name
-        # Rightly called unknown.
         row["strange"] = patch.name == UNKNOWN and not truth.in_library
         row["right"] = truth.name == patch.name or (patch.metal_reference and truth.metal)
         if truth.metal:
@@ -307,7 +308,10 @@ def _format_estimate(estimate: PermittivityFigures) -> dict[str, str]:
 
 
 def describe_coverage(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
-    """Say how many positions of each board are masked; `masks`: board to bool [row, column]. "" if it is empty."""
+    """Return a sentence on the number of masked positions of each board; "" if `masks` is empty.
+
+    `masks` maps a board to bool [row, column].
+    """
     if not masks:
         return ""
     if not any(m.any() for m in masks.values()):
@@ -335,7 +339,7 @@ def make_imaging_table(imaging: Any) -> Table | None:
 
 
 def _is_unknown(value: Any) -> bool:
-    """True for None, and for numbers that are not finite: just computed figures have them where files have null."""
+    """True for None, and for numbers that are not finite, which files store as null."""
     return value is None or (isinstance(value, float | np.floating) and not np.isfinite(value))
 
 
@@ -392,7 +396,7 @@ def format_heading(key: str) -> str:
 
 
 def list_key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """Return the headline figures: value and text."""
+    """Return the main numbers of the report, which are shown at its top: value and text."""
     out: list[dict[str, str]] = []
 
     def add(value: str, what: str) -> None:
@@ -427,7 +431,7 @@ def list_key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[di
 
 
 def _compute_received_shares(quality: ScanQuality) -> list[tuple[str, str]]:
-    """Return shares of rows and frames received: of the plan, or of recorded rows in products without `coverage`."""
+    """Return the received shares of planned rows and frames, or without `coverage` of frames of recorded rows."""
     if coverage := quality.coverage:
         share = percent(coverage.frames_received, coverage.frames_planned, 2)
         shares = [(share, f"of {format_value(coverage.frames_planned)} planned frames received")]
@@ -539,7 +543,10 @@ def _format_cells(*cells: str, share: float | None = None) -> dict[str, Any]:
 
 
 def _tabulate_boards(boards: Any) -> Table | None:
-    """Return a table of a line for each figure and a column for each board, narrow enough for a phone; None without."""
+    """Return a table with a line for each figure and a column for each board; None without boards.
+
+    It is narrow enough for a phone.
+    """
     if not isinstance(boards, dict) or not boards:
         return None
     flat_boards = {name: _flatten_board(board) for name, board in boards.items()}
@@ -570,7 +577,7 @@ def _flatten_board(board: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tabulate_residuals(boards: Any) -> Table | None:
-    """Return a table of `synchronisation`: a line for each stage, a column for each board's quantity; None without."""
+    """Return a table of `synchronisation`: a line for each stage, a column for each quantity; None if empty."""
     if not isinstance(boards, dict):
         return None
     flat_residuals: dict[str, dict[str, Any]] = {}

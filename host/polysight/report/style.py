@@ -1,9 +1,9 @@
 """Style of all figures: colours, fonts, axes in millimetres, titles, colour bars, labels, legends, PNG bytes.
 
-Materials have the colour-blind safe palette of Paul Tol ("muted", then "light"). Only matplotlib's object interface is
-used: no global state, no display. Its own font has no Chinese, Japanese or Korean: other installed fonts are tried, and
-a name that no font can draw becomes a short ASCII label. The page itself shows all names in full, by the browser's
-fonts.
+The colours of materials are from the palettes "muted" and "light" of Paul Tol, which are safe for colour-blind readers.
+Only matplotlib's object interface is used, which needs no global state and no display. The font of matplotlib has no
+Chinese, Japanese or Korean: other installed fonts are tried, and a name that no font can draw is replaced by a short
+ASCII label. The text of the page shows all names in full, with the browser's fonts.
 """
 
 from __future__ import annotations
@@ -48,19 +48,19 @@ METAL_COLOUR = "#C9D3DE"
 REFUSED_COLOUR = "#8d949e"
 # Hatching of patches that were not judged.
 HATCH = "////"
-# Two names side by side need this gap, otherwise they read as one.
+# Least gap between two names side by side, which would otherwise look like one name; points of 1/72 inch.
 _GAP_PT = 8.0
-# Margins of an axes hold a number of five characters, the axis labels and a title.
+# Margins of an axes in inches: there is room for a number of five characters, the axis labels and a title.
 _LEFT_IN = 0.66
 _BOTTOM_IN = 0.5
 _TOP_IN = 0.28
 RIGHT_IN = 0.1
-"""Margin on the right of an axes."""
+"""Margin on the right of an axes, inches."""
 BAR_IN = 0.62
-"""Margin on the right of an axes with a colour bar, its numbers and its label."""
+"""Margin on the right of an axes with a colour bar, its numbers and its label, inches."""
 # Height of a line of a legend, inches.
 _LEGEND_LINE_IN = 0.195
-# Characters of a name in a legend: two names fit side by side below a map.
+# Largest number of characters of a name in a legend: two such names fit side by side below a map.
 _LONGEST_NAME = 26
 
 MATPLOTLIB_FONT = "DejaVu Sans"
@@ -132,7 +132,8 @@ def make_figure(width: float, height: float, right_in: float) -> Figure:
 def set_margins(fig: Figure, right_in: float, below_in: float = 0.0) -> None:
     """Leave room for titles, axis labels and tick labels, `right_in` on the right, and `below_in` for a legend.
 
-    It stands for matplotlib's "constrained" layout, which measures all texts four times: longer than the drawing.
+    This replaces matplotlib's "constrained" layout, which measures all texts four times and takes longer than the
+    drawing.
     """
     width, height = fig.get_size_inches()
     fig.subplots_adjust(
@@ -145,7 +146,7 @@ def set_margins(fig: Figure, right_in: float, below_in: float = 0.0) -> None:
 
 def style_axes(ax: Axes, title: str, simulated: bool) -> None:
     """Draw the title, axis labels in millimetres, grey ticks, and the word SIMULATED for simulated data."""
-    # A given height saves the search for one above all ticks, which looks at every text of the figure.
+    # With a given height, matplotlib does not search for a height above all ticks, for which it measures every text.
     ax.set_title(title, loc="left", y=1.0, fontsize=11, color=INK, fontweight="bold")
     if simulated:
         ax.text(
@@ -162,7 +163,7 @@ def style_axes(ax: Axes, title: str, simulated: bool) -> None:
 
 
 def colour_bar(fig: Figure, ax: Axes, shown: ScalarMappable, label: str = "", extend: str = "neither") -> Colorbar:
-    """Draw a colour bar beside an axes; it is opaque even if the image fades."""
+    """Draw a colour bar beside an axes. It is opaque, even if the image is partly transparent."""
     bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.03, extend=extend)
     bar.set_label(label, fontsize=8, color=MUTED)
     bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
@@ -260,7 +261,7 @@ def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
     gap = _GAP_PT * fig.dpi / 72
     boxes = [label.text.get_window_extent() for label in labels]
     frames = [(label.text.axes or fig).bbox for label in labels]
-    # A pixel beyond the frame does not show.
+    # A label that crosses the frame by one pixel is accepted: this cannot be seen.
     is_outside = any(b.x0 < f.x0 - 1 or b.x1 > f.x1 + 1 for b, f in zip(boxes, frames, strict=True))
     touching = any(a.overlaps(b) for a, b in combinations([_widen(b, gap) for b in boxes], 2))
     if not is_outside and not touching:
@@ -304,6 +305,7 @@ def encode_png(fig: Figure) -> bytes:
     """Return a figure as PNG bytes without matplotlib's version (`Software`): the same data gives the same file."""
     buffer = io.BytesIO()
     # `savefig` would draw everything twice, the first time only to place the axes; `print_png` places them as it draws.
-    # Z_RLE compresses runs of even colour: files 7 % larger than by zlib's usual search, in two thirds of its time.
+    # Z_RLE compresses only runs of equal bytes: the files are 7 % larger than with zlib's usual search, and it takes
+    # two thirds of the time.
     FigureCanvasAgg(fig).print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_type": zlib.Z_RLE})
     return buffer.getvalue()

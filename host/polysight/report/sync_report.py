@@ -1,6 +1,7 @@
 """Residual frequency, phase and amplitude errors after synchronisation, for any scan: `polysight sync-report`.
 
-It is Fig. 15 of the POLySIGHT paper for one scan: histograms after each of four stages, with the Cramer-Rao bounds.
+For one scan it shows what Fig. 15 of the POLySIGHT paper shows: histograms of the errors after each of four stages,
+with the Cramer-Rao bounds.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from polysight_shared.files import write_atomically
 
 QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
 _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
-# Bins of a histogram (chosen): an odd number, so that one is centred at zero.
+# Number of bins of a histogram; chosen. It is odd, so that one bin is centred at zero.
 _BINS = 121
-# Histograms reach this many standard deviations of the first row to either side; chosen.
+# Range of a histogram to either side of zero, in standard deviations of the first row; chosen.
 _RANGE_STDS = 5.0
 
 
@@ -31,7 +32,7 @@ _RANGE_STDS = 5.0
 class _Stage:
     """Running sums of one stage: squares, count, and a histogram of each of `QUANTITIES`.
 
-    `reach` [3]: the histograms go from -reach to reach, which the first row decides.
+    The histograms go from -`reach` to `reach` [3], which is computed from the first row.
     """
 
     reach: NDArray[np.float64]
@@ -91,9 +92,13 @@ class SyncReport:
     def bounds(self) -> dict[str, tuple[float, float, float]]:
         """Return Cramer-Rao bounds (Hz, rad, relative amplitude) of one tone as strong as the direct path, by stage.
 
-        Rife and Boorstyn 1974: var(w) = 6 / (snr N (N^2 - 1)), var(phase at the centre) = 1 / (2 snr N), and the same
-        for relative amplitude; N samples on every RX. The bound of an aligned chirp is that of its deviation from its
-        burst. A chirp with an echo close to the direct path may lie below.
+        For N samples on every RX (Rife and Boorstyn 1974)
+
+            var(w) = 6 / (snr N (N^2 - 1))
+            var(phase at the centre) = var(relative amplitude) = 1 / (2 snr N)
+
+        with the angular frequency w in radians per sample. The bound of an aligned chirp is that of its deviation from
+        its burst. The error of a chirp with an echo close to the direct path may be below the bound of one tone.
         """
         if not self.chirps or not self._snr:
             return {}
@@ -105,7 +110,7 @@ class SyncReport:
             f = np.sqrt(6 / (snr * n * (n**2 - 1))) / (2 * np.pi) * self._rate
             return float(f), float(phase), float(phase)
 
-        # The mean of the burst is taken out of the errors of its chirps: 1 - 1 / chirps of their variance is left.
+        # The errors of chirps are relative to the mean of their burst, which leaves 1 - 1 / chirps of the variance.
         single_chirp = compute_bound_of_tone(self.snr * self._rx / (1 - 1 / chirps))
         mean = compute_bound_of_tone(self.snr * self._rx * chirps)
         # The residual of this stage is a difference of two signals with equal noise.

@@ -28,7 +28,7 @@ from polysight_shared.files import write_atomically
 FORMAT = "polysight-library-1"
 """Name of the file's format; files of other formats are refused."""
 SAME_ANGLE_DEG = 1.0
-"""Incidence angles that differ by no more count as one: |P| changes by some 10 % in a degree."""
+"""Largest difference of two incidence angles that count as one. |P| changes by some 10 % in a degree."""
 SIMULATED_LIBRARY = Path(__file__).with_name("simulated-library.npz")
 """The default library: simulated scans of examples/library."""
 
@@ -116,7 +116,7 @@ class Library:
         return tuple(round(sum(a) / len(a), 1) for a in out)
 
     def __repr__(self) -> str:
-        """Say what it holds: its arrays would fill a notebook."""
+        """Return a short description: the arrays would fill a notebook."""
         angles = ", ".join(f"{angle:g}" for angle in self.angles_deg)
         return f"<Library: {', '.join(self.names)}; {len(self.scans)} scans, {angles} degrees of incidence>"
 
@@ -224,9 +224,10 @@ class Library:
 
 
 def _read_entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:
-    """Cut the arrays of all entries, [pixel] one entry after the other, into entries; `rows` are their other fields.
+    """Cut the arrays of all pixels, which are sorted by entry, into entries; `rows` are the other fields of the
+    entries.
 
-    Raises KeyError, TypeError or ValueError if they do not fit.
+    Raises KeyError, TypeError or ValueError if arrays and fields do not fit.
     """
     if not h.shape == v.shape == p.shape or h.ndim != 1 or sum(r["pixels"] for r in rows) != h.size:
         raise ValueError(f"arrays {h.shape}, {v.shape}, {p.shape}")
@@ -285,7 +286,7 @@ def split_by_angle(x: Real) -> tuple[Real, Real, npt.NDArray[np.complex128]]:
 Measure = Literal["paper", "inverse", "log"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 Distances = tuple[Real, Real, Real]
-# Stands for an infinite P, at the Brewster angle.
+# Value that replaces an infinite P, which occurs at the Brewster angle.
 _LARGEST_RATIO = 1e12
 
 
@@ -343,7 +344,7 @@ def count_votes(neighbour_classes: npt.NDArray[np.intp], classes: int) -> npt.ND
     `neighbour_classes` [rows, neighbours] are numbers from 0 to `classes` - 1.
     """
     rows = len(neighbour_classes)
-    # One count over the cells of the whole table, row after row.
+    # The cells of the table are numbered row after row, so that one call of `bincount` counts all votes.
     cell = neighbour_classes + classes * np.arange(rows)[:, None]
     return np.bincount(cell.ravel(), minlength=rows * classes).reshape(rows, classes)
 
@@ -381,9 +382,9 @@ class Samples:
 
     @property
     def independent(self) -> npt.NDArray:
-        """Groups without common specimens, [n]: scans of the same labelled plate are joined.
+        """Groups without common specimens, [n]: scans that show the same labelled plate are joined to one group.
 
-        If no material is in two groups then, the scans themselves: the same specimens are in training and test.
+        If then no material is in two groups, the result is `groups`, although training and test data share specimens.
         """
         if self.specimens is None or not (self.specimens != "").any():
             return self.groups
@@ -414,7 +415,9 @@ class Samples:
 
     @classmethod
     def from_library(cls, library: Library, pixels_per_patch: int | None = None) -> Samples:
-        """Return the pixels of a library of one angle, grouped by scan; of each patch at most so many, at random.
+        """Return the pixels of a library of one angle, grouped by scan.
+
+        Of each patch at most `pixels_per_patch` pixels are taken at random; None: all.
 
         Raises DataError if no pixel is usable.
         """
@@ -477,7 +480,7 @@ class Samples:
         their_rows = []
         groups = []
         patches = []
-        # Angles are known only if both are.
+        # The angles of the result are known only if those of both parts are.
         angles: tuple[float, ...] = ()
         if self.angles_deg and other.angles_deg:
             angles = self.angles_deg + other.angles_deg
@@ -512,13 +515,15 @@ class NamedScan:
     Attributes
     ----------
     pixel_names, pixel_distance
-        Likeliest material of each pixel, [n], and its distance over the threshold: above 1 is unknown.
+        Likeliest material of each pixel, [n], and distance to it in units of its threshold: above 1 the pixel is
+        unknown.
     patches
         Patch numbers, sorted, [patches].
     names, confidence, distance
-        The same of each patch, [patches], and its confidence: a probability, or the share of its pixels.
+        Material and distance of each patch in the same way, [patches], and its confidence: a probability, or the share
+        of its pixels that have this name.
     distances
-        Distance of each patch to each material over the threshold, [patches, materials]; None: not known.
+        Distance of each patch to each material in units of its threshold, [patches, materials]; None: not known.
     probabilities, materials
         Probability of each material and, last, of none of them, [patches, materials + 1]; the materials' names. None
         for models without probabilities.
@@ -552,7 +557,7 @@ class Model(ABC):
 
     @abstractmethod
     def classify_pixels(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Classify each pixel independently: return name [n] and distance over the threshold [n]."""
+        """Classify each pixel independently: return its name [n] and its distance in units of the threshold [n]."""
 
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
         """Name the pixels and patches of one scan; `patches` [n] is the patch number of each pixel.
@@ -563,9 +568,9 @@ class Model(ABC):
 
 
 def name_by_majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
-    """Name each patch as most of its pixels, given the name, distance and patch number of each pixel, [n].
+    """Give each patch the name of most of its pixels; name, distance and patch number of each pixel are given, [n].
 
-    Its confidence is their share, its distance the median over all of its pixels.
+    The confidence of a patch is the share of its pixels with this name, its distance the median over all its pixels.
     """
     ids, patch, count = np.unique(patches, return_inverse=True, return_counts=True)
     names, name_of_pixel = np.unique(pixel_names, return_inverse=True)

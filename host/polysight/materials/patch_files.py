@@ -35,6 +35,9 @@ SAME_PATCH_MM = 20.0
 centres of neighbouring plates."""
 NEAR_MM = 4.0
 """Largest distance between pixels of two scans that show the same spot: about the resolution."""
+# Numbers in a row of the array of dispersions, and in each of the two rows of the array of cases.
+_DISPERSION_NUMBERS = 8
+_CASE_NUMBERS = 7
 
 
 @dataclass(frozen=True)
@@ -128,8 +131,8 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
         evidence_covariance=np.array([e.covariance for e in evidence], np.float64).reshape(-1, 2, 2),
         evidence_share=np.array([e.library_share for e in evidence], np.float64),
         evidence_brightness=np.reshape([[e.brightness_off, e.brightness_std] for e in evidence], (-1, 2)),
-        evidence_dispersion=np.reshape([_pack_dispersion(e.dispersion) for e in evidence], (-1, 8)),
-        evidence_cases=np.reshape([_pack_cases(e.cases) for e in evidence], (-1, 2, 7)),
+        evidence_dispersion=np.reshape([_pack_dispersion(e.dispersion) for e in evidence], (-1, _DISPERSION_NUMBERS)),
+        evidence_cases=np.reshape([_pack_cases(e.cases) for e in evidence], (-1, 2, _CASE_NUMBERS)),
     )
     return buffer.getvalue()
 
@@ -137,7 +140,7 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
 def _pack_dispersion(dispersion: PatchDispersion | None) -> Real:
     """Return three changes, their standard deviations, and the band in Hz, float64 [8]; all NaN for None."""
     if dispersion is None:
-        return np.full(8, np.nan)
+        return np.full(_DISPERSION_NUMBERS, np.nan)
     return np.concatenate([dispersion.change, dispersion.std, dispersion.band_hz])
 
 
@@ -154,7 +157,7 @@ def _pack_cases(cases: Sequence[RatioCase]) -> Real:
     A row holds the probability, real and imaginary part of t = V / H, and the four numbers of their covariance.
     """
     rows = [[case.probability, *split_complex(case.inverse_ratio), *case.covariance.flat] for case in cases]
-    return np.array(rows) if rows else np.full((2, 7), np.nan)
+    return np.array(rows) if rows else np.full((2, _CASE_NUMBERS), np.nan)
 
 
 def _unpack_cases(rows: Real) -> tuple[RatioCase, ...]:
@@ -162,7 +165,7 @@ def _unpack_cases(rows: Real) -> tuple[RatioCase, ...]:
 
     Raises ValueError for rows of another shape, or probabilities that are not positive or whose sum is not 1.
     """
-    known_rows = [row for row in rows.reshape(2, 7) if np.isfinite(row).all()]
+    known_rows = [row for row in rows.reshape(2, _CASE_NUMBERS) if np.isfinite(row).all()]
     probabilities = [row[0] for row in known_rows]
     if known_rows and not (min(probabilities) > 0 and np.isclose(sum(probabilities), 1)):
         raise ValueError("the probabilities of the cases of a patch are not positive, or their sum is not 1")
@@ -199,8 +202,8 @@ def _read_evidence(arrays: Mapping[str, npt.NDArray], labels: Sequence[int]) -> 
     """Return the evidence of the patches with these numbers. Raises ValueError if the arrays do not fit."""
     # Files of earlier releases hold neither brightness nor dispersion nor cases.
     brightness = arrays.get("evidence_brightness", np.full((len(labels), 2), np.nan))
-    dispersions = arrays.get("evidence_dispersion", np.full((len(labels), 8), np.nan))
-    cases = arrays.get("evidence_cases", np.full((len(labels), 2, 7), np.nan))
+    dispersions = arrays.get("evidence_dispersion", np.full((len(labels), _DISPERSION_NUMBERS), np.nan))
+    cases = arrays.get("evidence_cases", np.full((len(labels), 2, _CASE_NUMBERS), np.nan))
     columns = zip(
         arrays["evidence_theta_rad"],
         arrays["evidence_ratio"],
@@ -226,7 +229,7 @@ def _read_evidence(arrays: Mapping[str, npt.NDArray], labels: Sequence[int]) -> 
 def _read_patch(row: Mapping[str, Any], places: Real, features: Real) -> ScanPatch:
     """Return a patch of the file. Raises KeyError, TypeError or ValueError if its row is damaged."""
     x, y = row["centre_mm"]
-    # As text, so that a number with a fraction raises ValueError: int(1.5) would be 1.
+    # The number is converted from its text, so that one with a fraction raises ValueError: int(1.5) would be 1.
     label = int(str(row["label"]))
     return ScanPatch(label, (float(x), float(y)), row["truth"], places, features)
 
@@ -251,7 +254,7 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
         for partner in partners:
             partner_places = partner.places_mm - partner.centre_mm
             if not len(partner_places):
-                # No pixel is in all scans. Any features do here: none of them is kept.
+                # No pixel is in all scans. The features that stand here do not matter, because none of them is kept.
                 near_enough[:] = False
                 columns.append(patch.features)
                 continue

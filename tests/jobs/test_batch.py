@@ -78,7 +78,8 @@ def make_scans(folder, *names):
 def make_job(data, out, **options):
     """Return the job of one scan with these settings."""
     text = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
-    return batch.make_jobs([(data, Settings(**text))], out)[0]
+    (job,) = batch.make_jobs([(data, Settings(**text))], out)
+    return job
 
 
 def make_jobs(folder, *names):
@@ -162,7 +163,8 @@ def test_a_scan_is_processed_again_only_after_a_change_of_its_data(tmp_path):
     batch.process_many(make_jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
 
     def is_finished():
-        return batch.is_finished(make_jobs(tmp_path / "in", "scan")[0])
+        (job,) = make_jobs(tmp_path / "in", "scan")
+        return batch.is_finished(job)
 
     no_data = ("operator.json", "program/process.log", "export/image.nc", "labels.json", "control/request.json")
     for name in (*no_data, "products/report.html", "samples/RH.npy", "raw/RH/0004.part"):

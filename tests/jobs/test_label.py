@@ -157,7 +157,8 @@ def test_labels_of_a_scan_folder_are_saved_in_the_folder_of_its_rows(tmp_path):
     (scan / "manifest.jsonl").write_text("")
     for folder_given in (scan, scan / "products"):
         assert main(["label", str(folder_given), *NAMED]) == 0
-        assert find_labels(folder_given)[0].resolve() == (scan / "labels.json").resolve()
+        path, _ = find_labels(folder_given)
+        assert path.resolve() == (scan / "labels.json").resolve()
     assert not (scan / "products" / "labels.json").exists()
 
 

@@ -2,6 +2,7 @@
 
 import queue
 import random
+import re
 import threading
 from contextlib import closing
 from itertools import pairwise
@@ -286,7 +287,9 @@ def test_a_burst_that_exceeds_the_buffer_of_spidev_is_refused_with_the_size_to_s
     if needed_bytes > bufsiz:
         with expect_refusal(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
             trigger.make_spi_burst(trigger.BurstSpec(*burst), bufsiz)
-        advised_bytes = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
+        advice = re.search(r"bufsiz=(\d+)`", e.value.remedy)
+        assert advice is not None
+        advised_bytes = int(advice[1])
         assert needed_bytes <= advised_bytes
         trigger.make_spi_burst(trigger.BurstSpec(*burst), advised_bytes)
     else:

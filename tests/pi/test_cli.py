@@ -223,8 +223,11 @@ def test_the_advised_commands_for_keys_work(run_command, tmp_path):
     status, _, err = run_command("keys", "--dir", folder, "--client", "laptop")
     assert status == USAGE_ERROR
     assert not folder.exists()
-    assert run_command(*read_advice(err)[1:])[0] == SUCCESS
-    assert run_command("keys", "--dir", folder, "--client", "laptop")[0] == SUCCESS
+    _, *advised_words = read_advice(err)
+    status, _, _ = run_command(*advised_words)
+    assert status == SUCCESS
+    status, _, _ = run_command("keys", "--dir", folder, "--client", "laptop")
+    assert status == SUCCESS
 
     (folder / "allowed_clients").write_bytes(b"\xff\xfe\x00")
     for option in (["--list"], ["--client", "b"], ["--revoke", "laptop"]):
@@ -234,12 +237,16 @@ def test_the_advised_commands_for_keys_work(run_command, tmp_path):
     assert read_advice(err) == ["rm", str(folder / "allowed_clients")]
 
     (folder / "allowed_clients").write_text("")
-    assert run_command("keys", "--dir", folder, "--list")[1] == "no client is allowed\n"
+    _, out, _ = run_command("keys", "--dir", folder, "--list")
+    assert out == "no client is allowed\n"
 
     (folder / "pi.key_secret").write_text("public-key = 'short'\nsecret-key = 'short'\n")
     with make_server_context() as context, expect_refusal(ErrorCode.FILE_MISSING, "CURVE") as error:
         create_replier(context, "tcp://0.0.0.0:*", folder).close()
-    assert run_command(*shlex.split(error.value.remedy.split("`")[1])[1:])[0] == SUCCESS
+    _, advised_command, _ = error.value.remedy.split("`", 2)
+    _, *advised_words = shlex.split(advised_command)
+    status, _, _ = run_command(*advised_words)
+    assert status == SUCCESS
 
 
 def test_a_full_disk_is_the_reported_cause_when_keys_cannot_be_made(run_command, tmp_path, monkeypatch):

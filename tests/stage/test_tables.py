@@ -38,7 +38,8 @@ def test_pins_of_sketch_and_emulated_board_are_those_of_the_published_rig_and_fu
     assert published.items() <= board.items()
     assert len(set(board.values())) == len(board)
     emulator = (REPO / "simulators/polysight_simulators/uno/rig.c").read_text()
-    emulated = read_pins(re.findall(r"enum (\{ TRIGGER.*?\});", emulator, re.DOTALL)[0])
+    (enumeration,) = re.findall(r"enum (\{ TRIGGER.*?\});", emulator, re.DOTALL)
+    emulated = read_pins(enumeration)
     # Two pins have other names in the emulator than in the sketch.
     names_in_sketch = {"DRIVERS_OFF": "ENABLE", "EMERGENCY_STOP": "EMERGENCY"}
     assert {names_in_sketch.get(name, name): pin for name, pin in emulated.items()} == board
@@ -200,8 +201,9 @@ class BootLoader:
                 # Set device
                 self._take(20)
             elif command == b"E":
-                # Set extended parameters
-                self._take(self._take(1)[0] - 1)
+                # Set extended parameters: their number, which counts itself, and the others
+                (size,) = self._take(1)
+                self._take(size - 1)
             elif command == b"U":
                 # Load address, in words
                 address = 2 * int.from_bytes(self._take(2), "little")

@@ -31,6 +31,9 @@ from polysight_shared.errors import ErrorCode, ScanError
 from polysight_shared.faults import PiFault
 from polysight_shared.messages import Capture, RunStarted, RunStopped
 
+# Takes of a row with the default limit of two retakes.
+ALL_TAKES = (1, 2, 3)
+
 
 def compute_digests(scan: ScanFolder) -> dict[str, str]:
     """Return the digest of each committed payload by its file."""
@@ -59,7 +62,8 @@ def test_a_scan_without_faults_is_bit_exact_and_valid(rig, payload, tmp_path):
     assert validate(tmp_path / "s") == []
     events = read_events(tmp_path / "s" / "events.msgpack").events
     assert [e.seq for e in events] == list(range(1, len(events) + 1))
-    assert (type(events[0]), type(events[-1])) == (RunStarted, RunStopped)
+    assert isinstance(events[0], RunStarted)
+    assert isinstance(events[-1], RunStopped)
     assert sum(isinstance(e, Capture) for e in events) == rig.instrument.grid.columns * rig.instrument.grid.rows
     assert {p.phase for p in calls} >= {"connect", "home", "row", "committed", "end"}
     assert calls[-1].committed == 4
@@ -71,7 +75,7 @@ def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
     assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     assert list_errors(tmp_path / "s") == []
     ended = load_facts(tmp_path / "s", "scan_ended")[0]
-    # Those that come after a gap are fetched again, too.
+    # Events that come after a gap are fetched again, too.
     assert ended["events_refetched"] >= lost_events
 
 
@@ -91,7 +95,9 @@ def test_a_row_whose_reply_was_lost_runs_once(rig, tmp_path):
 # Numbers of the packets of a row: 0 to 25.
 @pytest.mark.parametrize("dropped", [{0}, {5}, {25}, {0, 1, 25}])
 def test_a_row_with_lost_packets_is_retaken(rig, payload, tmp_path, dropped):
-    rig.cards["RV"].drop[1, 1] = dropped
+    row = 1
+    first_take = 1
+    rig.cards["RV"].drop[row, first_take] = dropped
     messages = []
 
     def record_messages_of_rows(p) -> None:
@@ -102,18 +108,20 @@ def test_a_row_with_lost_packets_is_retaken(rig, payload, tmp_path, dropped):
     assert messages == ["row 0", "row 1", "row 1, take 2", "row 2", "row 3"]
     assert (result.exit_status, result.retakes) == ("success", 1)
     scan = ScanFolder.load(tmp_path / "s")
-    assert scan.committed_rows()[1].take == 2
-    assert scan.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
-    rejected = load_facts(scan, "row_rejected")
-    assert [(r["row"], r["take"]) for r in rejected] == [(1, 1)]
-    assert "RV" in rejected[0]["reasons"][0]
+    assert scan.committed_rows()[row].take == first_take + 1
+    assert scan.read_row("RV", row).payload.tobytes() == payload("RV", row, rig.instrument.row_bytes)
+    (rejected,) = load_facts(scan, "row_rejected")
+    assert rejected["row"] == row
+    assert rejected["take"] == first_take
+    assert "RV" in rejected["reasons"][0]
     assert list_errors(tmp_path / "s") == []
 
 
 def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
-    for take in (1, 2, 3):
-        rig.cards["RV"].drop[1, take] = {3}
-    with expect_refusal(ErrorCode.ROW_INCOMPLETE, "RV", "3 takes"):
+    row = 1
+    for take in ALL_TAKES:
+        rig.cards["RV"].drop[row, take] = {3}
+    with expect_refusal(ErrorCode.ROW_INCOMPLETE, "RV", f"{len(ALL_TAKES)} takes"):
         run_scan(rig.instrument, tmp_path / "s")
     scan = ScanFolder.load(tmp_path / "s")
     assert list(scan.committed_rows()) == [0]
@@ -121,18 +129,21 @@ def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
     assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
     result = resume_scan(tmp_path / "s")
     assert result.exit_status == "success"
-    assert ScanFolder.load(tmp_path / "s").committed_rows()[1].take == 4
+    # The resumed scan counts on from the takes before.
+    assert ScanFolder.load(tmp_path / "s").committed_rows()[row].take == len(ALL_TAKES) + 1
     assert list_errors(tmp_path / "s") == []
 
 
 def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
-    for take in (1, 2, 3):
-        rig.cards["RV"].drop[1, take] = {3, 4, 9}
+    row = 1
+    for take in ALL_TAKES:
+        rig.cards["RV"].drop[row, take] = {3, 4, 9}
     result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
-    assert (result.exit_status, result.incomplete_rows) == ("success", [1])
-    assert load_facts(result.folder, "row_committed")[1]["faults"] == [{"kind": "lost_on_the_way", "board": "RV"}]
-    data = ScanFolder.load(tmp_path / "s").read_row("RV", 1)
-    assert data.missing == [(3 * 1456, 5 * 1456), (9 * 1456, 10 * 1456)]
+    assert result.exit_status == "success"
+    assert result.incomplete_rows == [row]
+    assert load_facts(result.folder, "row_committed")[row]["faults"] == [{"kind": "lost_on_the_way", "board": "RV"}]
+    data = ScanFolder.load(tmp_path / "s").read_row("RV", row)
+    assert data.missing == [(3 * FULL, 5 * FULL), (9 * FULL, 10 * FULL)]
     truth = np.frombuffer(payload("RV", 1, rig.instrument.row_bytes), dtype=np.uint8)
     assert data.mask is not None
     assert np.array_equal(data.payload[~data.mask], truth[~data.mask])
@@ -141,12 +152,13 @@ def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
 
 
 def test_an_incomplete_row_with_a_frame_too_few_is_masked_as_a_whole(rig, tmp_path):
-    for take in (1, 2, 3):
-        rig.cards["RH"].missing_end_bytes[1, take] = rig.instrument.frame_bytes
+    row = 1
+    for take in ALL_TAKES:
+        rig.cards["RH"].missing_end_bytes[row, take] = rig.instrument.frame_bytes
     run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
     scan = ScanFolder.load(tmp_path / "s")
-    assert scan.read_row("RH", 1).missing == [(0, rig.instrument.row_bytes)]
-    assert scan.committed_rows()[1].boards["RH"].frames_received == 0
+    assert scan.read_row("RH", row).missing == [(0, rig.instrument.row_bytes)]
+    assert scan.committed_rows()[row].boards["RH"].frames_received == 0
 
 
 def test_a_scan_that_was_stopped_after_a_row_resumes_and_keeps_its_rows(rig, payload, tmp_path):
@@ -330,7 +342,9 @@ def test_the_retake_of_a_row_that_ended_early_is_complete(make_instrument, paylo
     finally:
         rig.close()
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert [(f["row"], f["take"]) for f in load_facts(result.folder, "row_rejected")] == [(1, 1)]
+    (rejected,) = load_facts(result.folder, "row_rejected")
+    assert rejected["row"] == 1
+    assert rejected["take"] == 1
     assert result.folder.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
 
@@ -340,7 +354,7 @@ def test_a_card_that_sent_nothing_is_configured_again_before_the_retake(rig, tmp
     card = rig.cards["RH"]
 
     def mute_until_set_up_again(p) -> None:
-        if (p.state, p.row, p.phase) == ("running", 1, "state"):
+        if p.phase == "state" and p.state == "running" and p.row == 1:
             card.silent_data = card.codes_received.count(CONFIGURE) == 2
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=mute_until_set_up_again)

@@ -1,4 +1,7 @@
-"""The chain of a manifest: count and digest of the line before in every line, so that missing lines are found."""
+"""The chain of a manifest: a line has its number and the digest of the line before, which shows missing lines.
+
+Lines count from 1 in messages. Line 1 is `scan_started`; the line of row k is line k + 2.
+"""
 
 import hashlib
 import itertools
@@ -44,7 +47,9 @@ def test_missing_lines_are_reported_and_the_others_are_valid(lines, first, count
     remaining = [*lines[:first], *lines[min(first + count, len(FACTS) - 1) :]]
     content = parse(b"".join(remaining))
     assert len(content.facts) == len(remaining)
-    assert [(f.facts["line"], f.facts["lost"]) for f in content.faults] == [(first + 1, len(lines) - len(remaining))]
+    (fault,) = content.faults
+    assert fault.facts["line"] == first + 1
+    assert fault.facts["lost"] == len(lines) - len(remaining)
 
 
 def test_a_line_that_was_replaced_is_reported_at_the_next_line(lines):
@@ -58,7 +63,9 @@ def test_a_line_that_was_replaced_is_reported_at_the_next_line(lines):
 
 
 def test_repeated_lines_are_reported(lines):
-    assert [f.facts["line"] for f in parse(b"".join([*lines[:4], *lines[2:]])).faults] == [5]
+    # Lines 3 and 4 come again, as lines 5 and 6.
+    content = parse(b"".join([*lines[:4], *lines[2:]]))
+    assert [fault.facts["line"] for fault in content.faults] == [5]
 
 
 @pytest.mark.parametrize("damage", [b"{}\n", b"\x00\xff\n", b""])
@@ -90,6 +97,9 @@ def test_a_manifest_of_an_older_release_without_a_chain_is_read_and_continued_wi
 # --- a scan folder --------------------------------------------------------------------------------------------------
 
 
+LINE_OF_ROW_2 = 4
+
+
 @pytest.fixture
 def scan(tmp_path) -> Path:
     return write_scan(tmp_path / "scan")
@@ -103,13 +113,13 @@ def remove_line(folder: Path, *numbers: int) -> None:
 
 def test_a_missing_line_of_a_row_is_an_error_that_names_line_and_row(scan):
     assert validate(scan) == []
-    remove_line(scan, 4)
+    remove_line(scan, LINE_OF_ROW_2)
     error_text = "\n".join(list_errors(scan))
-    assert "manifest.jsonl line 4" in error_text
+    assert f"manifest.jsonl line {LINE_OF_ROW_2}" in error_text
     assert "row 2 " in error_text
     folder = ScanFolder.load(scan)
     assert list(folder.rows()) == [0, 1, 3]
-    assert {f.facts["line"] for f in folder.manifest_faults} == {4}
+    assert {fault.facts["line"] for fault in folder.manifest_faults} == {LINE_OF_ROW_2}
 
 
 def test_a_missing_line_of_the_last_row_is_detected_by_the_count_in_the_last_line(scan):
@@ -125,13 +135,13 @@ def test_a_missing_line_of_the_last_row_is_detected_by_the_count_in_the_last_lin
 
 def test_a_missing_line_whose_row_was_retaken_is_only_a_note(scan):
     lost_row = load_facts(scan, "row_committed")[2]
-    remove_line(scan, 4)
+    remove_line(scan, LINE_OF_ROW_2)
     with ScanFolder.load(scan).writer() as writer:
         writer.append({"fact": "scan_resumed", "rows_missing": 1})
         writer.append({**lost_row, "take": 2})
         writer.append({"fact": "scan_ended", "exit_status": "success", "reason": "", "rows_committed": 4})
     assert list_errors(scan) == []
-    assert "line 4" in "\n".join(map(to_text, validate(scan)))
+    assert f"line {LINE_OF_ROW_2}" in "\n".join(map(to_text, validate(scan)))
 
 
 def test_a_row_withdrawn_after_the_end_is_not_a_fault_of_the_manifest(scan):

@@ -83,11 +83,11 @@ def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
     for bit in sample(range(8 * len(whole_lines[record])), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / "manifest.jsonl", 8 * offset + bit)
-        # The line end: this line and the next are one
+        # Without its line end this line and the next are one.
         end = bit // 8 == len(whole_lines[record]) - 1
         named = list_faults(scan) + [n for n in list_faults(scan, "note") if "incomplete" in n or "damaged" in n]
         assert len(named) == 1
-        # The last line is cut off, others stay where they are
+        # A damaged last line is cut off; other damaged lines stay where they are.
         is_kept = record == -1 or (record == -2 and end)
         resumed = resume(scan, undisturbed_scan, damaged_lines=0 if is_kept else 1)
         assert resumed == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]

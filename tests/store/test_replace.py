@@ -2,12 +2,13 @@
 
 import gc
 import json
+import math
 from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.capture.records import Record, make_log, make_mask
+from tests.support.capture.records import FULL, Record, make_log, make_mask
 from tests.support.refusals import expect_refusal
 from tests.support.rigs import make_rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
@@ -32,17 +33,21 @@ def scan_with(folder: Path, lost: int | Collection[int], has_wrong_packet: bool 
     scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
     size = rig.row_bytes
     frame = rig.frame_bytes
-    record = Record.make(size, 5000, 7)
-    earlier_record = Record.make(2000, 3000, 5)
+    # The card's counters at the start of the record. The earlier record has 2000 bytes in two packets before it.
+    start = Counters(byte_count=5000, sequence=7)
+    record = Record.make(size, start.byte_count, start.sequence)
+    earlier_record = Record.make(2000, count=3000, sequence=5)
     lost_packets = {lost} if isinstance(lost, int) else set(lost)
     received = [packet for k, packet in enumerate(record.packets) if k not in lost_packets]
-    packets = [earlier_record.packets[1], *received, record.packets[4]]
+    leftover = earlier_record.packets[1]
+    duplicate = record.packets[4]
+    packets = [leftover, *received, duplicate]
     boards = {}
     with scan.writer() as writer:
         for board in rig.recorded:
             path = scan.row_path(board.name, 0)
             log = make_log(size, packets)
-            evidence = Evidence(size, frame, past=EarlierRecords(Counters(5000, 7)))
+            evidence = Evidence(size, frame, past=EarlierRecords(start))
             placed, out = place_record(log, frame, evidence.past)
             packets_crc = write_packets(path.with_suffix(PACKETS_SUFFIX), log, evidence, placed)
             path.write_bytes(out.tobytes())
@@ -79,7 +84,7 @@ def test_rows_with_the_same_result_are_not_touched(tmp_path):
     contents_before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
     assert [(r.changed, r.why_unchanged) for r in replace_rows(scan)] == [(False, "")] * 2
     assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == contents_before
-    check_rows(scan, data, [(9 * 1456, 10 * 1456)])
+    check_rows(scan, data, [(9 * FULL, 10 * FULL)])
 
 
 def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
@@ -88,19 +93,22 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 1
     assert "committed  differently" in capsys.readouterr().out
     assert replace_folder(scan.path, as_json=False) == 0
-    assert f"{len(data)} bytes missing before, 1456 now" in capsys.readouterr().out
+    assert f"{len(data)} bytes missing before, {FULL} now" in capsys.readouterr().out
     scan.reload()
     assert list_errors(scan.path) == []
-    check_rows(scan, data, [(9 * 1456, 10 * 1456)])
+    check_rows(scan, data, [(9 * FULL, 10 * FULL)])
     board = scan.committed_rows()[0].boards["RH"]
     # The manifest has the counts of the new index: all packets but the lost one.
-    placed = -(-len(data) // 1456) - 1
-    assert (board.packets, board.leftover, board.duplicates) == (placed, 1, 1)
+    assert board.packets == math.ceil(len(data) / FULL) - 1
+    assert board.leftover == 1
+    assert board.duplicates == 1
     names = {p.name for p in scan.path.rglob("raw/RH/*")}
     assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS_SUFFIX}"}
     assert inspect_placement(scan.path / "raw/RH/0000-1.idx", as_json=True) == 0
     report = json.loads(capsys.readouterr().out)
-    assert (report["leftover"], report["duplicates"], report["missing"]) == (1, 1, [[9 * 1456, 10 * 1456]])
+    assert report["leftover"] == 1
+    assert report["duplicates"] == 1
+    assert report["missing"] == [[9 * FULL, 10 * FULL]]
     assert [r.changed for r in replace_rows(scan)] == [False, False]
 
 
@@ -109,7 +117,7 @@ def test_of_more_than_eight_missing_ranges_the_first_are_printed(tmp_path, capsy
         scan, _ = scan_with(tmp_path / str(count), lost=range(9, 9 + 2 * count, 2))
         assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 0
         (line,) = [text for text in capsys.readouterr().out.splitlines() if text.startswith("missing ")]
-        expected = [f"{k * 1456}..{(k + 1) * 1456}" for k in range(9, 9 + 2 * count, 2)]
+        expected = [f"{k * FULL}..{(k + 1) * FULL}" for k in range(9, 9 + 2 * count, 2)]
         if count > 8:
             expected = [*expected[:8], "..."]
         printed = line.removeprefix("missing ").strip().split(", ")
@@ -132,7 +140,7 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
         scan = ScanFolder.load(scan.path)
         assert list_errors(scan.path) == [], counting.done[position - 1]
         replace_rows(scan)
-        check_rows(scan, data, [(9 * 1456, 10 * 1456)])
+        check_rows(scan, data, [(9 * FULL, 10 * FULL)])
     # Files that were not closed are to be reported in this test, not in the next one.
     gc.collect()
 

@@ -407,7 +407,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
 
 
 def _score_models(data: Path, as_json: bool) -> int:
-    """Cross-validate every model on a library; print shares of correct names. A library of several angles: the last."""
+    """Cross-validate every model on a library, of several angles at the last one; print shares of correct names."""
     from polysight.materials import MODELS, Samples, score
 
     library = _load_library(data)
@@ -415,12 +415,18 @@ def _score_models(data: Path, as_json: bool) -> int:
         sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
         library = library.at_angle(library.angles_deg[-1])
     samples = Samples.from_library(library)
-    # Each model has two scores: with whole scans left out, then with single pixels left out.
-    scores = [score(samples, model, by_pixel=score_by_pixel) for model in MODELS for score_by_pixel in (False, True)]
+    # Each model has two scores: with whole scans left out, and with single pixels left out.
+    scores_by_scan = []
+    scores_by_pixel = []
+    for model in MODELS:
+        scores_by_scan.append(score(samples, model, by_pixel=False))
+        scores_by_pixel.append(score(samples, model, by_pixel=True))
+    pairs = list(zip(scores_by_scan, scores_by_pixel, strict=True))
     source = _describe_origin(library.simulated)
     if as_json:
+        scores = [score_of_model for pair in pairs for score_of_model in pair]
         rows = [{k: v for k, v in asdict(s).items() if "confusion" not in k and k != "names"} for s in scores]
-        best = max(scores[::2], key=lambda s: s.pixels + s.patches)
+        best = max(scores_by_scan, key=lambda s: s.pixels + s.patches)
         content = {"source": source, "names": best.names, "scores": rows}
         content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
         print_json(content)
@@ -430,12 +436,12 @@ def _score_models(data: Path, as_json: bool) -> int:
         f"{'':44s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
         f"{'model':44s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
     )
-    for score_by_scan, score_by_pixel in zip(scores[::2], scores[1::2], strict=True):
+    for score_by_scan, score_by_pixel in pairs:
         sys.stdout.write(
             f"{score_by_scan.model:44s}{score_by_scan.pixels:11.1%}{score_by_scan.patches:11.1%}"
             f"{score_by_pixel.pixels:12.1%}{score_by_pixel.patches:12.1%}\n"
         )
-    if missing := scores[0].not_judged:
+    if missing := scores_by_scan[0].not_judged:
         sys.stdout.write(f"not judged with scans left out, because only one scan contains them: {', '.join(missing)}\n")
     return 0
 

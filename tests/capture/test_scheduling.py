@@ -1,5 +1,6 @@
 """Core and priority of a receiver, the receive buffer, and warnings if the system grants less."""
 
+import errno
 import os
 import subprocess
 
@@ -68,7 +69,7 @@ def test_the_rights_are_written_to_the_files_that_logins_and_desktops_read(tmp_p
 
 def test_without_permission_core_and_priority_are_warnings(monkeypatch):
     def refuse(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
     for name in ("sched_setaffinity", "sched_setscheduler", "setpriority"):
         monkeypatch.setattr(os, name, refuse)
@@ -101,19 +102,23 @@ def test_buffer_below_two_bursts_is_refused_with_the_command(tmp_path):
 
 def test_a_buffer_of_exactly_two_bursts_is_enough(tmp_path):
     """Linux grants twice the bytes, and a full packet of 1456 bytes takes 2304."""
-    assert usable_packets(2304) == 2
-    assert usable_packets(2303) == 1
-    assert usable_packets(1152) == 1
-    # Room for 100 packets; a burst has 50.
-    granted = 100 * 2304 // 2
-    assert check_receive_buffer("RH", granted, granted, 50 * 1456, tmp_path / "absent") == ""
-    assert check_receive_buffer("RH", granted + 1, granted, 50 * 1456, tmp_path / "absent") == ""
-    with expect_refusal(ErrorCode.VALUE_INVALID, f"{granted} bytes, less than two bursts of {50 * 1456 + 1}"):
-        check_receive_buffer("RH", granted, granted, 50 * 1456 + 1, tmp_path / "absent")
-    assert "granted" in check_receive_buffer("RH", granted, granted + 1, 50 * 1456, tmp_path / "absent")
+    kernel_bytes_a_packet = 2304
+    assert usable_packets(kernel_bytes_a_packet) == 2
+    assert usable_packets(kernel_bytes_a_packet - 1) == 1
+    assert usable_packets(kernel_bytes_a_packet // 2) == 1
+    burst = 50 * FULL
+    packets_of_two_bursts = 2 * 50
+    granted = packets_of_two_bursts * kernel_bytes_a_packet // 2
+    no_file = tmp_path / "absent"
+    assert check_receive_buffer("RH", granted, granted, burst, no_file) == ""
+    assert check_receive_buffer("RH", granted + 1, granted, burst, no_file) == ""
+    with expect_refusal(ErrorCode.VALUE_INVALID, f"{granted} bytes, less than two bursts of {burst + 1}"):
+        check_receive_buffer("RH", granted, granted, burst + 1, no_file)
+    assert "granted" in check_receive_buffer("RH", granted, granted + 1, burst, no_file)
     # The advised size has room for two bursts and two packets more; the request is half of what Linux then grants.
-    with expect_refusal(ErrorCode.VALUE_INVALID, f"rmem_max={(100 + 2) * 2304 // 2}`"):
-        check_receive_buffer("RH", 1000, 1000, 50 * 1456, tmp_path / "absent")
+    advised_bytes = (packets_of_two_bursts + 2) * kernel_bytes_a_packet // 2
+    with expect_refusal(ErrorCode.VALUE_INVALID, f"rmem_max={advised_bytes}`"):
+        check_receive_buffer("RH", 1000, 1000, burst, no_file)
 
 
 @pytest.mark.parametrize(("granted", "needed"), [(8192, 8192), (16384, 8192), (8192, 8193), (8192, 1 << 23)])

@@ -43,8 +43,8 @@ def test_echoes_of_a_scan_are_those_of_the_planned_positions(tmp_path: Path):
     config.write_text(tomli_w.dumps(to_builtins(rig)))
     scene.write_text(SCENE)
     with closing(Bench(tmp_path)) as bench:
-        # Slower than real time. At 2 the emulated stage falls behind on a busy machine, so that simulated time is as fast as
-        # the host's. The host then takes it for real time, and refuses rows whose packets come irregularly.
+        # Slower than real time. At 2 the emulated stage falls behind on a busy machine, so that simulated time is as
+        # fast as the host's. The host then takes it for real time, and refuses rows whose packets come irregularly.
         rig_options = ("--dir", tmp_path / "rig", "--with-pi", "--uno", "--time-scale", "0.5")
         simulated = bench.start(*SIMULATED_RIG, "--config", config, "--scene", scene, *rig_options)
         options = ("--out", tmp_path / "scan", "--no-process")

@@ -11,7 +11,7 @@ from polysight.settings import DEFAULT, Settings
 
 
 class Pipeline:
-    """Processes a scan: add rows, then `finish`. `live`: images of the rows so far; `inputs`: the settings' files."""
+    """Processes a scan: add its rows, then call `finish`. If `live`, images of the rows so far can be formed, too."""
 
     def __init__(
         self,
@@ -20,7 +20,7 @@ class Pipeline:
         inputs: process.Inputs = process.NO_INPUTS,
         *,
         live: bool = False,
-        samples: process.SampleUse = "none",  # "read" restores samples kept earlier, "keep" also saves other rows'
+        samples: process.SampleUse = "none",  # "read": use kept samples if there are any; "keep": and save the others
     ) -> None:
         self.source = source
         self.settings = settings
@@ -60,9 +60,9 @@ class Pipeline:
         return synced
 
     def form_images(self, from_sums: bool = False) -> imaging.Images:
-        """Form both images on the rig's plane, not relative to metal; `from_sums`: from a live scan's running sums."""
+        """Form the images of H and V on the plane of the rig file; `from_sums`: from the sums of a live scan."""
         if self.settings.sparse and not from_sums:
-            # Reconstructs missing positions: of the images into `samples.filled`, of the sub-bands as returned.
+            # The images are then formed from `samples.filled`, in which missing positions are reconstructed.
             self.sub_bands = self.samples.fill_missing()
         with self.quality.measure_time("image"):
             if from_sums:
@@ -94,30 +94,30 @@ class Pipeline:
             optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
             optics = replace(optics, phase_left_rad=self.quality.phase_left_rad)
             result = materials.analyse(images, optics, known_scene, classifier)
-            metal_plane = None if known_scene is None else known_scene.plane  # of a plate scanned separately
-            self.quality.add_materials(result, incidence, images.valid, metal_plane)
+            # Gains of H and V at each pixel, if a metal plate was scanned separately.
+            metal_gains = None if known_scene is None else known_scene.plane
+            self.quality.add_materials(result, incidence, images.valid, metal_gains)
         with self.quality.measure_time("sub-bands"):
             band_images = self.sub_bands.finish(self.source.mirrored, self.plane.form_images)
             if band_images:
-                result = materials.add_bands(result, self.sub_bands.bands, band_images, optics, metal_plane)
+                result = materials.add_bands(result, self.sub_bands.bands, band_images, optics, metal_gains)
         return result
 
     def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
-        """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
+        """Find plane and materials, and judge them; `plates`: the true ones. Without a result there are no names."""
         classifier = process.load_classifier(self.settings, self.rig)
         scene = process.convert_boxes_to_patches(self.settings, self.inputs, images.x_m, images.y_m)
         has_metal = scene.metal is not None
-        metal_plane = self.calibration.metal_plane(self.rig, self.inputs.reference, has_metal, self.settings.bands)
+        metal_gains = self.calibration.metal_plane(self.rig, self.inputs.reference, has_metal, self.settings.bands)
         images = self.place_plane(images)
-        if metal_plane is not None:
+        if metal_gains is not None:
             # Only pixels whose gain the scan of the metal plate has measured can be judged.
-            images = images.limit_to_area(metal_plane.valid_on(images.x_m, images.y_m))
-            scene = replace(scene, metal=metal_plane)
+            images = images.limit_to_area(metal_gains.valid_on(images.x_m, images.y_m))
+            scene = replace(scene, metal=metal_gains)
         result = self.find_materials(images, replace(scene, plates=plates), classifier)
         verdict = process.judge(self.quality, result, self.plane, classifier, self.rig.check)
         if not verdict.usable:
             result = result.without_result()
-        # `plates`, the true ones of the scene if they are known, are handed on.
         return process.Findings(images, result, verdict, self.plane, classifier, plates)
 
     def finish(self, out: Path, plates: materials.Plates = (), progress: Progress = no_progress) -> process.Products:
@@ -129,6 +129,6 @@ class Pipeline:
         progress("materials")
         findings = self.examine(images, plates)
         progress("figures and report")
-        unnamed = process.explain_unnamed(self.settings, self.rig)
-        scan = process.collect_processed_scan(out, self.source, self.rig, findings, self.quality, unnamed)
-        return process.save_materials(out, scan, findings.analysis, unnamed)
+        why_unnamed = process.explain_unnamed(self.settings, self.rig)
+        scan = process.collect_processed_scan(out, self.source, self.rig, findings, self.quality, why_unnamed)
+        return process.save_materials(out, scan, findings.analysis, why_unnamed)

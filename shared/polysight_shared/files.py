@@ -44,7 +44,7 @@ def open_regular(path: Path) -> BinaryIO:
                 "give a file",
                 code=ErrorCode.FILE_FOREIGN,
             )
-        # The file has a descriptor of its own, so that this one is closed in every case.
+        # The returned file has a duplicate, so that this descriptor can be closed here, also after an error.
         return os.fdopen(os.dup(descriptor), "rb")
     finally:
         os.close(descriptor)
@@ -62,8 +62,12 @@ def read_bounded(path: Path, max_bytes: int) -> bytes:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        data = file.read(max_bytes + 1) if size <= max_bytes else b""
-    if (size := max(size, len(data))) > max_bytes:
+        data = b""
+        if size <= max_bytes:
+            data = file.read(max_bytes + 1)
+    # The file may have grown meanwhile.
+    size = max(size, len(data))
+    if size > max_bytes:
         problem = f"{path}: {size} bytes, the limit is {max_bytes}"
         raise DataError(problem, "it is another kind of file", "check the path", code=ErrorCode.FILE_TOO_LARGE)
     return data
@@ -98,7 +102,7 @@ def name_in_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _name_instead(path: Path) -> Iterator[None]:
+def _name_in_os_errors(path: Path) -> Iterator[None]:
     """Let an OSError of the block name this path, instead of an internal file that the user does not know."""
     try:
         yield
@@ -111,14 +115,14 @@ def _name_instead(path: Path) -> Iterator[None]:
 def _require_file_or_nothing(path: Path) -> None:
     """Raise OSError if a folder, a device or a pipe has this path: a rename would fail, or remove it."""
     if path.is_dir():
-        # ".", "/" and ".." are folders, too, and have no name that a file beside them could have.
+        # Also ".", "/" and "..", which end in no name for a temporary file in the same folder.
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, "is a device or a pipe; files are written here", str(path))
+        raise OSError(errno.EINVAL, "is a device or a pipe, not a file", str(path))
 
 
 def require_writable(path: Path) -> None:
-    """Raise OSError if no file can be written at this path: before the work whose result it shall hold."""
+    """Raise OSError if no file can be written at this path; called before long work, so that it is not lost."""
     _require_file_or_nothing(path)
     require_writable_folder(path.absolute().parent)
 
@@ -153,8 +157,8 @@ def write_together(files: Mapping[Path, bytes]) -> None:
     """Write files that belong together.
 
     Each is written to a temporary file in its folder and flushed to disk; then all are renamed, in their order. A
-    program killed between two renames leaves the old last file: readers must take that one as the sign that the others
-    are complete.
+    program that is killed between two renames has not renamed the last file yet. Readers must therefore check the last
+    file: if it is new, so are all others.
 
     Raises
     ------
@@ -172,13 +176,13 @@ def write_together(files: Mapping[Path, bytes]) -> None:
             part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
             with name_in_errors(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-            with _name_instead(path), part.open("xb") as f:
+            with _name_in_os_errors(path), part.open("xb") as f:
                 parts[path] = part
                 f.write(data)
                 f.flush()
                 os.fsync(f.fileno())
         for path, part in parts.items():
-            with _name_instead(path):
+            with _name_in_os_errors(path):
                 part.replace(path)
     except BaseException:
         for part in parts.values():

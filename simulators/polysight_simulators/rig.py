@@ -2,8 +2,10 @@
 
     python -m polysight_simulators.rig --config instrument.toml --scene SCENE.toml --dir DIR --time-scale 30 --with-pi
 
-Writes into DIR instrument.toml, the rig file with the addresses of these processes, truth.json, the truth of the scene
-(not with --pattern), reports of the cards, and logs. Prints `ready DIR/instrument.toml` when all processes are ready.
+It writes into DIR: `instrument.toml`, the rig file with the addresses of these processes; `truth.json`, the plates of
+the scene (not with --pattern); reports of the cards; logs. It prints `ready DIR/instrument.toml` when all processes are
+ready.
+
 The *wires* process relays edges of GPIO lines and the stage's motion between the others.
 SIGTERM, SIGINT or the end of a process ends all of them; SIGUSR1 switches all cards off and on. *Wire time* is the
 clock of the simulated signals: wall time times the time scale.
@@ -61,8 +63,8 @@ _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBU
 def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
     """Set native radar control in the rig file's table: an entry for each board, and a start offset of the receivers.
 
-    A start offset in the rig file stays; if that and `if_offset_hz` are 0, it is the published rig's. The board's
-    address follows in `move_to_free_subnet`.
+    A receiver's start offset in the rig file is not changed, unless it is 0: then it becomes `if_offset_hz`, or that of
+    the published rig if `if_offset_hz` is 0, too. `move_to_free_subnet` sets the address of each board.
     """
     names = [board["name"] for board in table["boards"]]
     # A simulated board's USB serial number is its name.
@@ -73,7 +75,7 @@ def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
 
 
 def _apply_if_offset(table: dict[str, Any], if_offset_hz: float) -> None:
-    """Add the scene's IF offset to the start offsets of the receivers, as if they were programmed so."""
+    """Add the scene's IF offset to the start offsets of the receivers: the rig file describes what they do."""
     for board in table["boards"]:
         if board["role"] != "transmit":
             board["start_offset_hz"] += if_offset_hz
@@ -82,9 +84,11 @@ def _apply_if_offset(table: dict[str, Any], if_offset_hz: float) -> None:
 def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = False) -> Instrument:
     """Derive the rig file of a simulated rig in `folder`: the scene's overrides, free addresses, paths, heartbeats.
 
-    `native` overrides the radar control of the rig file; the scene's IF offset is then that of receivers without a
-    start offset of their own. It is left out if the rig file itself has native control. Raises ConfigError if an
-    override breaks a rule, DeviceError if no loopback subnet is free.
+    The scene's IF offset is added to the start offsets of the receivers. With `native`, which sets native radar
+    control, only receivers without a start offset get it. If the rig file itself has native control, it is ignored: the
+    boards have the start offsets that the host programs.
+
+    Raises ConfigError if an override breaks a rule, DeviceError if no loopback subnet is free.
     """
     disturbed_rig = rig
     if_offset_hz = 0.0
@@ -265,13 +269,16 @@ class RigProcesses:
 
 def card_groups(rig: Instrument) -> list[str]:
     """Group the boards into processes: one for each recorded board; the others join the first."""
-    groups = [[b.name] for b in rig.recorded] or [[]]
-    groups[0] += [b.name for b in rig.boards if not b.record]
-    return [",".join(g) for g in groups]
+    groups = [[board.name] for board in rig.recorded]
+    not_recorded = [board.name for board in rig.boards if not board.record]
+    if not groups:
+        groups = [[]]
+    groups[0] += not_recorded
+    return [",".join(names) for names in groups]
 
 
 def _list_card_options(scene: Path | None, options: RigOptions) -> list[str]:
-    """Return the options of the process of the cards that follow from those of the rig."""
+    """Return the command-line options of a card process; `options` are those of the whole rig."""
     words = []
     if scene is not None:
         # `derive` has put the scene's IF offset into the rig file, or left it out.

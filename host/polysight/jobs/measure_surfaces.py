@@ -30,7 +30,7 @@ CALIBRATED_PLACE_STD_M = 3e-4
 
 
 def take_samples(pipeline: Pipeline) -> tuple[surfaces.Samples, surfaces.Samples]:
-    """Return the samples of H and V that a pipeline holds, x from TX to RX."""
+    """Return the samples of H and V that a pipeline holds; their x axis points from TX to RX."""
     h, v = (take_board_samples(board, pipeline.source.mirrored) for board in pipeline.builder.boards.values())
     return h, v
 
@@ -65,7 +65,7 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> surfaces.Sampl
 
 
 def find_uncertainty(rig: Instrument, *, places_known: bool) -> surfaces.Uncertainty:
-    """Return the standard errors of leakage, axes and places of a rig."""
+    """Return the standard errors of a rig: of its leakage, of the antennas' axes and of their places."""
     polarimetry = rig.polarimetry
     # The prior is the rms of |leakage|; the standard deviation of its real and of its imaginary part is smaller by
     # sqrt(2).
@@ -113,8 +113,8 @@ def load_sphere_points(file: SphereFile) -> surfaces.SeenEchoes:
 def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
     """Return the echoes of a calibration file.
 
-    Columns: position (3), path, slope (2), bend (xx, xy, yy), amplitude (real, imaginary), its error, rise over the
-    band.
+    Columns: position (3), path, slope (2), bend (xx, xy, yy), amplitude (real, imaginary), error of the amplitude, and
+    ln of the amplitude in the upper half of the band over that in the lower half.
     """
     count = len(rows)
     # Second derivatives [n, 2, 2] of the path by the stage offset.
@@ -147,7 +147,7 @@ def thin_out(metal: surfaces.SeenEchoes) -> surfaces.SeenEchoes:
 def analyse_points(
     pipeline: Pipeline,
     optics: surfaces.Optics,
-    seen_rows: surfaces.SeenEchoes,
+    points: surfaces.SeenEchoes,
     reference: surfaces.Reference | None = None,
 ) -> surfaces.Surface:
     """Return the named surfaces of a scan's points; without a metal `reference` the calibration's sphere is used."""
@@ -155,7 +155,7 @@ def analyse_points(
     if reference is None and calibration.sphere is not None:
         reference = make_reference(load_sphere_points(calibration.sphere))
     surface = surfaces.analyse_surface(
-        seen_rows,
+        points,
         optics,
         reference,
         uncertainty=find_uncertainty(pipeline.rig, places_known=calibration.places is not None),
@@ -193,16 +193,16 @@ def has_steep_patch(products: Path) -> bool:
 def add_surfaces(pipeline: Pipeline, products: Path) -> None:
     """Measure the surfaces of a processed scan, write them into its products, and write the report again with them.
 
-    The range gate is that of the images, so that only what lies near the object plane is seen. quality.json counts the
-    time.
+    The range gate is that of the images, so that only what lies near the object plane is seen. `quality.json` is
+    written again with the time that this takes.
     """
     from polysight.report import write_report
 
     with pipeline.quality.measure_time("surfaces"):
         optics = make_rig_optics(pipeline.rig)
-        seen_rows = find_points_in_rows(pipeline, optics)
-        if len(seen_rows):
-            save_surface(products, analyse_points(pipeline, optics, seen_rows))
+        points = find_points_in_rows(pipeline, optics)
+        if len(points):
+            save_surface(products, analyse_points(pipeline, optics, points))
     quality = read_products(products).quality
     timed = msgspec.structs.replace(quality, seconds_per_stage=pipeline.quality.seconds_per_stage)
     write_json(products / QUALITY, timed)

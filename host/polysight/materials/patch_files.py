@@ -204,22 +204,21 @@ def _read_evidence(arrays: Mapping[str, npt.NDArray], labels: Sequence[int]) -> 
     brightness = arrays.get("evidence_brightness", np.full((len(labels), 2), np.nan))
     dispersions = arrays.get("evidence_dispersion", np.full((len(labels), _DISPERSION_NUMBERS), np.nan))
     cases = arrays.get("evidence_cases", np.full((len(labels), 2, _CASE_NUMBERS), np.nan))
-    columns = zip(
+    columns = [
         arrays["evidence_theta_rad"],
         arrays["evidence_ratio"],
         arrays["evidence_covariance"],
         arrays["evidence_share"],
         brightness,
-        map(_unpack_dispersion, dispersions),
-        map(_unpack_cases, cases),
-        strict=True,
-    )
+        [_unpack_dispersion(numbers) for numbers in dispersions],
+        [_unpack_cases(numbers) for numbers in cases],
+    ]
     rows = [
         RatioEvidence(
             theta_rad=float(angle), inverse_ratio=complex(ratio), covariance=covariance, library_share=float(share),
             brightness_off=float(off), brightness_std=float(std), dispersion=dispersion, cases=both_cases,
         )
-        for angle, ratio, covariance, share, (off, std), dispersion, both_cases in columns
+        for angle, ratio, covariance, share, (off, std), dispersion, both_cases in zip(*columns, strict=True)
     ]  # fmt: skip
     if any(row.covariance.shape != (2, 2) for row in rows):
         raise ValueError("covariances are not [patch, 2, 2]")

@@ -13,10 +13,12 @@ from polysight_simulators.radars import LineServer, RadarSocket
 
 # Edges that are taken from the wires before the cards send again; chosen.
 EDGES_PER_TURN = 2048
-# Time between reads of the wires with pulses: many frames per call cost less than a few.
+# Shortest time between two reads of pulses from the wires. Computing many frames in one call takes less time than
+# computing a few in each of several calls.
 GATHER_S = 0.01
-# Longest wait for something to do; chosen.
+# Longest wait for something to do, and shortest time between two looks whether a record has ended; chosen.
 IDLE_S = 0.1
+SHORTEST_LOOK_S = 0.001
 
 
 class CardServer:
@@ -25,7 +27,7 @@ class CardServer:
     Parameters
     ----------
     time_scale
-        Wire time over wall time.
+        Speed of the simulated signals: their time over wall time.
     clock_s
         Wall clock.
     track
@@ -33,7 +35,7 @@ class CardServer:
     power_cycle
         Event that switches every card off and on.
     control, chips
-        Control servers of the radars, or their USB chips under native control.
+        Control servers of the radars, or the radars' simulated USB chips if the rig file has native control.
     """
 
     def __init__(
@@ -89,9 +91,10 @@ class CardServer:
             # Radars are armed before the row's first pulse is sent, so control comes before the wires.
             for server in self._control:
                 server.serve()
-            # Wires before commands: keep the order of a pulse and a later command.
-            commands = any(key.fileobj is not self._wires for key, _ in ready)
-            if commands or (self._listening and (self._unread or ready)):
+            # A pulse was sent before the command that comes after it, so that the wires are read before commands.
+            has_commands = any(key.fileobj is not self._wires for key, _ in ready)
+            wires_are_ready = self._listening and (self._unread or len(ready) > 0)
+            if has_commands or wires_are_ready:
                 self._take_edges()
             for chip in self._chips:
                 chip.serve()
@@ -102,16 +105,21 @@ class CardServer:
             for card in self._cards:
                 card.endpoint.serve_commands()
             self._select_cards()
-            timeout = min(self._work(card) for card in self._cards)
+            timeout = min(self._send_data(card) for card in self._cards)
             gather_s = self._next_read_s - self._clock_s()
             # Let pulses gather at the wires for a moment, and leave them there while a card cannot send what it has.
-            self._listen(gather_s <= 0 and not any(card.endpoint.sender.full for card in self._cards))
+            has_full_card = any(card.endpoint.sender.full for card in self._cards)
+            self._listen(is_needed=gather_s <= 0 and not has_full_card)
             if gather_s > 0:
                 timeout = min(timeout, gather_s)
 
     def _select_cards(self) -> None:
         """Register the cards' sockets, which change at a power cycle."""
-        changed_cards = [card for card in self._cards if self._bound.get(card, (0,))[0] != card.endpoint.bindings]
+        changed_cards = []
+        for card in self._cards:
+            is_registered = card in self._bound and self._bound[card][0] == card.endpoint.bindings
+            if not is_registered:
+                changed_cards.append(card)
         for card in changed_cards:
             if card in self._bound:
                 self._selector.unregister(self._bound[card][1])
@@ -149,7 +157,7 @@ class CardServer:
             self._pulse_ns = edge.t_ns
             rising[edge.line].append(edge.t_ns)
 
-    def _work(self, card: SimulatedCard) -> float:
+    def _send_data(self, card: SimulatedCard) -> float:
         """Send data and end the record in time; return the seconds until this card has more to do."""
         endpoint = card.endpoint
         # Seconds until more data may be sent; None: all is sent.
@@ -163,7 +171,8 @@ class CardServer:
         if card.card.deadline_s is None:
             return IDLE_S
         # A record's last packet is due `TAIL_S` of wire time after its data: look ten times in this time (chosen).
-        return min(IDLE_S, max(0.001, 0.1 * TAIL_S / self._time_scale))
+        look_s = 0.1 * TAIL_S / self._time_scale
+        return min(IDLE_S, max(SHORTEST_LOOK_S, look_s))
 
     def _listen(self, is_needed: bool) -> None:
         """Start or stop reading the wires; unread edges stay in the socket and the hub."""

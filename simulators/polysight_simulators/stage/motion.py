@@ -13,7 +13,7 @@ from polysight_shared.faults import StageError
 # Ticks of the sketch's step timer, 0.5 us (docs/spec/stage-line.md, timing).
 TICK_HZ = 2_000_000
 NS_PER_TICK = 1_000_000_000 // TICK_HZ
-# Slowest and fastest step rate, steps/s.
+# Slowest and fastest step rate, steps/s. A 16-bit timer cannot wait longer than 65,536 ticks: 1 / 30.5 s.
 MIN_RATE = 31
 MAX_RATE = 20_000
 # Bits of the switch inputs.
@@ -54,7 +54,7 @@ class StepEngine:
         self.y = 0
         # Trigger points that were passed in this row.
         self.points = 0
-        # Trigger pulses that were given; the caller counts them.
+        # Trigger pulses that were sent. They are counted by the caller, which knows when a pulse ends.
         self.pulses = 0
         # True if a hold is requested.
         self.hold = False
@@ -90,7 +90,7 @@ class StepEngine:
         # The debounced inputs, as bits.
         self.stable = 0
         # Number of successive readings that differed from them.
-        self._looks = 0
+        self._differing_readings = 0
         self.leg = Leg(0, 0, MIN_RATE)
         # The firmware starts with this acceleration; the host sets another one.
         self.set_accel(40_000)
@@ -98,9 +98,10 @@ class StepEngine:
     def set_accel(self, steps_s2: int) -> None:
         """Set the acceleration, steps/s^2."""
         self.accel = steps_s2
-        # Steps/s gained per tick, x 2^20: 2^20 / TICK_HZ = 8192 / 15625. `>> 4` makes it x 2^16, as the speed.
+        # Steps/s gained per tick, in units of 2^-20: a 2^20 / TICK_HZ = a 8192 / 15625. Speeds have units of 2^-16, so
+        # that `interval` shifts by 4 bits.
         self._accel_q20 = steps_s2 * 8192 // 15625
-        # Speed of the first step: its mean from rest, sqrt(2 a) / 2.
+        # Mean speed of the first step from rest: half its final speed sqrt(2 a), so sqrt(2 a) / 2 = sqrt(a / 2).
         self._slowest = max(MIN_RATE, math.isqrt(steps_s2 // 2))
 
     def ramp_steps(self, rate: int) -> int:
@@ -169,12 +170,12 @@ class StepEngine:
     def look(self, inputs: int) -> None:
         """Debounce the switches: `stable` changes after `DEBOUNCING_READINGS` successive differing readings."""
         if inputs == self.stable:
-            self._looks = 0
+            self._differing_readings = 0
         else:
-            self._looks += 1
-        if self._looks >= DEBOUNCING_READINGS:
+            self._differing_readings += 1
+        if self._differing_readings >= DEBOUNCING_READINGS:
             self.stable = inputs
-            self._looks = 0
+            self._differing_readings = 0
 
     def step(self, inputs: int) -> tuple[int, int, bool]:
         """Make the step that is due; return the steps of x and y (signed), and True if the trigger is raised."""
@@ -190,7 +191,9 @@ class StepEngine:
         if self.fault is not None:
             self.left = 0
             return 0, 0, False
-        if leg.until and not self.reached and bool(inputs & leg.until) != leg.until_open:
+        switch_is_closed = bool(inputs & leg.until)
+        state_to_reach = not leg.until_open
+        if leg.until and not self.reached and switch_is_closed == state_to_reach:
             # The homing switch has changed: brake to a stop.
             self.reached = True
             self.left = self.ramp
@@ -224,19 +227,21 @@ class StepEngine:
             clear_major = clear_y
             clear_minor = clear_x
         steps_before_braking = self.left - self.ramp - 1
-        # Step k after the next one is due (k TICK_HZ + carry) // rate ticks after it.
+        # Step k after the next one is due (k TICK_HZ + carry) // rate ticks after it, which is at most `wait_ticks` if
+        # k TICK_HZ + carry < (wait_ticks + 1) rate. With the next step itself these are the largest such k, plus 1.
         steps_in_time = ((wait_ticks + 1) * rate - 1 - self.carry) // TICK_HZ + 1
         n = min(steps_before_braking, steps_in_time, clear_major)
         if self.points_left:
             n = min(n, self.to_trigger - 1)
         if self.minor:
-            # Over n steps of the longer axis the other makes at most n minor / major + 1.
+            # Over n steps of the longer axis the other makes at most n minor / major + 1, which may be `clear_minor`.
             n = min(n, (clear_minor - 1) * self.major // self.minor)
         # A single step is left to `step`.
         if n < 2:
             return 0, 0, 0, 0
-        self._looks = 0
+        self._differing_readings = 0
         dx, dy, _ = self._advance(n)
+        # `interval` uses the duration of the last step.
         ticks_before = ((n - 1) * TICK_HZ + self.carry) // rate
         ticks, self.carry = divmod(n * TICK_HZ + self.carry, rate)
         self.ticks = ticks - ticks_before
@@ -290,7 +295,7 @@ class StepEngine:
             self.ticks, self.carry = divmod(TICK_HZ + self.carry, rate)
             return self.ticks
         elif self.left > self.ramp + 1:
-            # Accelerate.
+            # Accelerate: braking from one step more on the ramp needs one step more. Otherwise the speed is kept.
             if self.ramp == 0:
                 self.speed_q16 = self._slowest << 16
             else:

@@ -131,9 +131,16 @@ class Bench:
         )  # fmt: skip
         rig: Any = Rig()
         self._taker = RowTaker(
-            RIG, rig, radars, self.pi, "s", folder, self.stop, self.points.append,
-            lambda _, notice: self.notices.append(notice),
-        )  # fmt: skip
+            instrument=RIG,
+            rig=rig,
+            radars=radars,
+            pi=self.pi,
+            scan_id="s",
+            folder=folder,
+            stop=self.stop,
+            on_point=self.points.append,
+            notify=lambda _, notice: self.notices.append(notice),
+        )
 
     def _events(self) -> list[Any]:
         self.clock.now += LOOK_S

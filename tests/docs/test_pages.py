@@ -3,6 +3,7 @@
 import re
 import signal
 import tomllib
+from pathlib import PurePosixPath
 
 import numpy as np
 from docs.check.looking import page_faults
@@ -70,9 +71,11 @@ def test_the_drawing_of_the_wiring_has_the_pins_and_addresses_of_the_rig_file_an
     assert f"D{pin['TRIGGER']} trigger" in drawing
     for name in ("LEFT", "RIGHT", "X"):
         assert f"D{pin[name + '_PUL']}/D{pin[name + '_DIR']}" in drawing
+    # In the drawing two spaces follow the name of a pin or board: `D7  enable`, `RH  receives`.
     assert f"D{pin['ENABLE']}  enable" in drawing
     for board in rig["boards"]:
         _, _, last_byte_of_address = board["card_address"].rpartition(".")
+        # A text of the drawing stands between <text ...> and </text>: the name of the board is its first word.
         assert f">{board['name']}  " in drawing
         assert f"DCA1000EVM  .{last_byte_of_address}" in drawing
         assert board["host_address"] in drawing
@@ -87,8 +90,12 @@ def test_the_installation_sets_the_addresses_rights_and_limits_that_the_programs
     assert f"net.core.rmem_max = {rig['card']['receive_buffer_bytes']}" in rights
     host_address = re.search(r"addresses ([\d.]+)/24", text)[1]
     assert {board["host_address"] for board in rig["boards"]} == {host_address}
-    assert f"cd {rig['pi']['key_dir'].removesuffix('/keys')}\n" in (ROOT / "docs/how-to/bring-up.md").read_text()
-    assert rig["pi"]["key_dir"] in text
+    key_folder = PurePosixPath(rig["pi"]["key_dir"])
+    assert str(key_folder) in text
+    # The folder `keys` is in the folder of the settings. In that folder the program of the Pi is checked.
+    assert key_folder.name == "keys"
+    bring_up = (ROOT / "docs/how-to/bring-up.md").read_text()
+    assert f"cd {key_folder.parent}\n" in bring_up
 
 
 def test_the_example_of_a_label_file_is_valid(tmp_path):
@@ -96,13 +103,15 @@ def test_the_example_of_a_label_file_is_valid(tmp_path):
     (tmp_path / "labels.json").write_text(block.text, encoding="utf-8")
     axis_m = np.linspace(-0.1, 0.1, 101)
     boxes = check_labels(read_labels(tmp_path / "labels.json"), axis_m, axis_m)
-    assert [boxes.specimen(name) for name in boxes.boxes] == [None, "board 7", "2"]
+    # The specimen of oak is under the key `specimens` of the example, and that of oak#2 in the name of its box.
+    specimens = {name: boxes.specimen(name) for name in boxes.boxes}
+    assert specimens == {"copper": None, "oak": "board 7", "oak#2": "2"}
     assert boxes.metal == "copper"
     assert boxes.by_hand is True
 
 
 def test_the_python_code_on_the_page_about_imaging_runs(tmp_path, monkeypatch):
-    """The code uses packages that are not part of the public interface: their names may change without notice."""
+    """The code uses internal packages, whose names may change: then the page has to change, too."""
     scene = decode_scene(make_scene(COPPER, columns=4, rows=3), "test")
     simulate(load_published_rig(), scene, tmp_path / "scans" / "points")
     monkeypatch.chdir(tmp_path)

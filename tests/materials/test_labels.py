@@ -1,4 +1,4 @@
-"""Boxes with names: refused ones, and the content of a label file."""
+"""Named boxes in an image: which boxes and names are refused, and what label files and libraries keep of them."""
 
 import json
 
@@ -19,7 +19,7 @@ NAN = float("nan")
 
 
 def check_boxes(boxes, **fields):
-    """Return the labels if they can be used on the image above; `fields` are further ones of `Labels`."""
+    """Return labels with these boxes if they can be used on the image above; `fields` are the other fields."""
     return materials.check_labels(materials.Labels(boxes, "mm", **fields), X_M, Y_M)
 
 
@@ -43,12 +43,14 @@ CONFLICT = ErrorCode.VALUES_CONFLICT
         ({"copper": COPPER, "oak": (10, -10, float("inf"), 10)}, {}, INVALID, ("oak", "inf")),
         # Between the centres of pixels, which lie at 9, 11, ... mm
         ({"copper": COPPER, "oak": (10.2, 0.2, 10.4, 0.4)}, {}, ErrorCode.NO_DATA, ("oak",)),
-        ({"oak": OAK, "Oak": COPPER}, {}, ErrorCode.NAME_TAKEN, ("Oak", "oak", "#2")),
-        # No box, or two, with the name of a metal, or a metal that has no box
+        # Two names that differ only in their case: the message proposes Oak#2 for the second one.
+        ({"oak": OAK, "Oak": COPPER}, {}, ErrorCode.NAME_TAKEN, ("Oak", "oak", "Oak#2")),
+        # No box has the name of a metal; two boxes have one; the metal that is named has no box.
         ({"oak": OAK, "glass": COPPER}, {}, ErrorCode.KEY_MISSING, ("--metal", "oak, glass")),
         ({"brass": OAK, "copper": COPPER}, {}, ErrorCode.KEY_MISSING, ("--metal", "brass, copper")),
         ({"oak": OAK, "copper": COPPER}, {"metal": "silver"}, ErrorCode.KEY_UNKNOWN, ("silver", "oak, copper")),
-        # Names: a control character, too long, empty, reserved, a number, and one with an empty specimen
+        # Names with a control character, with more than 80 characters, empty, reserved, a number, and with an empty
+        # specimen
         ({"copper": COPPER, "a\x07b": OAK}, {}, INVALID, (r"'a\x07b'",)),
         ({"copper": COPPER, "n" * 300: OAK}, {}, INVALID, ("300", "80")),
         ({"copper": COPPER, " ": OAK}, {}, INVALID, ("name ''",)),
@@ -97,8 +99,8 @@ def test_the_specimen_of_a_box_is_given_or_stands_after_a_hash_in_its_name():
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        # A letter and its accent become one character, and spaces single ones. The second text is Japanese for rubber
-        # wood.
+        # A letter and its accent become one character. Spaces at the ends are removed, and several spaces become one.
+        # The second text is Japanese for rubber wood.
         ("  ha\u0308rtes  Holz\n", "h\u00e4rtes Holz"),
         ("\u6a61\u6728", "\u6a61\u6728"),
         ("cerise\u0301 #2", "ceris\u00e9#2"),
@@ -107,7 +109,9 @@ def test_the_specimen_of_a_box_is_given_or_stands_after_a_hash_in_its_name():
 )
 def test_names_of_any_script_are_kept_in_one_form(text, name):
     assert materials.normalise_box_name(text) == name
-    assert materials.clean_name(name.partition("#")[0]) == name.partition("#")[0]
+    # The name of the material, before the hash, already has the form in which it is kept.
+    material, _, _ = name.partition("#")
+    assert materials.clean_name(material) == material
 
 
 # Zero-width space, soft hyphen, word joiner and byte-order mark
@@ -139,8 +143,9 @@ def test_boxes_of_label_files_of_earlier_releases_are_in_pixels(tmp_path):
     assert labels_in_mm.boxes["copper"] == pytest.approx(COPPER)
     segmentation, _ = labels.patches(X_M, Y_M)
     segmentation_in_mm, _ = labels_in_mm.patches(X_M, Y_M)
-    # Copper is patch 1, the only one: the sum of the labels is its number of pixels.
-    assert segmentation.patches[0].mask.sum() == segmentation_in_mm.labels.sum()
+    # Copper is the only patch: the label of its pixels is 1, that of all others 0.
+    (copper,) = segmentation.patches
+    np.testing.assert_array_equal(segmentation_in_mm.labels, copper.mask.astype(int))
 
 
 @pytest.mark.parametrize(
@@ -158,7 +163,7 @@ def test_boxes_drawn_by_hand_are_checked_before_a_scan_is_processed_with_them():
     overlapping = materials.Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "copper", "oak"):
         convert_boxes_to_patches(DEFAULT, Inputs(overlapping), X_M, Y_M)
-    labels = materials.Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)
+    labels = materials.Labels({"tin": COPPER, "oak": OAK}, "mm", metal="tin", by_hand=True)
     patches = convert_boxes_to_patches(DEFAULT, Inputs(labels), X_M, Y_M)
     assert patches.metal == 1
     assert patches.names == {1: "tin", 2: "oak"}
@@ -181,16 +186,26 @@ def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
         content = dict(archive)
     meta = json.loads(content["meta"].tobytes())
     del meta["entries"][0]["specimen"]
-    np.savez(tmp_path / "old.npz", **(content | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}))
+    old_meta = json.dumps(meta).encode()
+    content["meta"] = np.frombuffer(old_meta, np.uint8)
+    np.savez(tmp_path / "old.npz", **content)
     assert materials.Library.load(tmp_path / "old.npz").entries[0].specimen is None
 
 
-# Right of copper, below it, and diagonally away from it
-@pytest.mark.parametrize("oak", [(0.0, -20.0, 20.0, 20.0), (-20.0, 5.0, 20.0, 20.0), (5.0, 5.0, 20.0, 20.0)])
-def test_boxes_next_to_or_above_each_other_do_not_overlap(oak):
+# In the second box the lower left corner of oak is moved 0.5 mm into copper.
+@pytest.mark.parametrize(
+    ("oak", "overlapping_oak"),
+    [
+        # Right of copper
+        ((0.0, -20.0, 20.0, 20.0), (-0.5, -20.0, 20.0, 20.0)),
+        # Above copper: y points up.
+        ((-20.0, 5.0, 20.0, 20.0), (-20.0, -0.5, 20.0, 20.0)),
+        # To the right and above
+        ((5.0, 5.0, 20.0, 20.0), (-0.5, -0.5, 20.0, 20.0)),
+    ],
+)
+def test_boxes_next_to_or_above_each_other_do_not_overlap(oak, overlapping_oak):
     copper = (-20.0, -20.0, 0.0, 0.0)
     assert set(check_boxes({"copper": copper, "oak": oak}).boxes) == {"copper", "oak"}
-    # The nearest corner is moved 0.5 mm into copper.
-    overlapping_oak = (min(oak[0], -0.5), min(oak[1], -0.5), *oak[2:])
     with expect_refusal(CONFLICT, "overlap"):
         check_boxes({"copper": copper, "oak": overlapping_oak})

@@ -1,5 +1,6 @@
-"""Rows, frames and positions compared with the plan: missing rows count as lost, columns in every direction."""
+"""Coverage of a scan: missing rows and positions are counted, with the right columns in rows of either direction."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -30,8 +31,9 @@ def copy_without_rows(scan: Path, to: Path, *rows: int) -> Path:
     """Return a copy of a scan without the lines of these rows in its manifest."""
     shutil.copytree(scan, to)
     lines = (to / MANIFEST).read_bytes().splitlines(keepends=True)
-    removed = tuple(f'"row":{row},'.encode() for row in rows)
-    (to / MANIFEST).write_bytes(b"".join(line for line in lines if not any(r in line for r in removed)))
+    # A line is one JSON object. The lines of a row have its number under the key `row`.
+    kept_lines = [line for line in lines if json.loads(line).get("row") not in rows]
+    (to / MANIFEST).write_bytes(b"".join(kept_lines))
     return to
 
 
@@ -49,19 +51,23 @@ def test_missing_rows_are_counted_as_absent(two_plates, tmp_path, command):
     assert coverage["positions_absent"] == 2 * COLUMNS
     assert coverage["frames_planned"] == FRAMES
     assert coverage["frames_received"] == FRAMES * (ROWS - 2) // ROWS
-    # The lines before which a row is missing
-    assert [line.split(":")[0] for line in coverage["manifest"]] == ["manifest.jsonl line 3", "manifest.jsonl line 16"]
+    # The first line describes the scan, and each row has one more. Row 2 is line 3, because row 0 precedes it. Row 16
+    # comes after the 14 rows that are left of rows 0 to 15.
+    lines_after_gaps = ["manifest.jsonl line 3", f"manifest.jsonl line {1 + 14 + 1}"]
+    assert [line.split(":")[0] for line in coverage["manifest"]] == lines_after_gaps
     # 2 of 17 rows are 11.8 %.
-    for value in ("15 of 17", "11.8 %", f"88.2 % of {FRAMES}", "manifest.jsonl line 3"):
+    for value in ("15 of 17", "11.8 %", f"88.2 % of {FRAMES}", lines_after_gaps[0]):
         assert value in output
     if command == "process":
         report = (out / "report.html").read_text(encoding="utf-8")
+        # A tile of the report has a share in bold, and below it of what: no tile may say that all was received.
         assert "100 %</b><span>of" not in report
-        for value in ("88.24 %", "15 of 17", "manifest.jsonl line 3"):
+        for value in ("88.24 %", "15 of 17", lines_after_gaps[0]):
             assert value in report
 
 
-# Row to lost positions, in the order of recording. Rows 1 and 3 run towards -x: position 0 is their last column.
+# Row to lost positions, in the order of recording, of seven in a row. Rows 1 and 3 are recorded towards -x: position n
+# is in column 6 - n there. So row 1 loses columns 6, 5 and 2, and row 3 loses column 0.
 LOST = {0: [0, 1, 4], 1: [0, 1, 4], 3: [6]}
 
 

@@ -13,17 +13,17 @@ T = TypeVar("T")
 
 
 @pytest.fixture
-def sample(request: pytest.FixtureRequest) -> Callable[[Sequence[T], int], list[T]]:
+def draw_cases(request: pytest.FixtureRequest) -> Callable[[Sequence[T], int], list[T]]:
     """Function that draws `n` cases with the first and the last, the same in every run; with --long up to 2000."""
 
-    def draw_sample(cases: Sequence[T], n: int) -> list[T]:
+    def draw(cases: Sequence[T], n: int) -> list[T]:
         n = 2000 if request.config.getoption("--long") else n
         if len(cases) <= n:
             return list(cases)
         chosen = random.Random(request.node.name).sample(range(len(cases)), n)
         return [cases[i] for i in sorted({0, len(cases) - 1, *chosen})]
 
-    return draw_sample
+    return draw
 
 
 @pytest.fixture(scope="session")

@@ -63,11 +63,11 @@ def is_row(event: object) -> bool:
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [-2, -1], ids=["row_committed", "scan_ended"])
-def test_manifest(undisturbed_scan, tmp_path, sample, record, tail):
+def test_manifest(undisturbed_scan, tmp_path, draw_cases, record, tail):
     whole_lines = read_lines(undisturbed_scan.path / "manifest.jsonl")
     lines_before = b"".join(whole_lines[: len(whole_lines) + record])
     last = whole_lines[record]
-    for cut in sample(range(len(last)), 8):
+    for cut in draw_cases(range(len(last)), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(lines_before + last[:cut] + tail)
         assert list_faults(scan) == []
@@ -77,10 +77,10 @@ def test_manifest(undisturbed_scan, tmp_path, sample, record, tail):
 
 
 @pytest.mark.parametrize("record", [1, -2, -1], ids=["row 0", "row 2, the last", "scan_ended"])
-def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
+def test_bit_of_the_manifest(undisturbed_scan, tmp_path, draw_cases, record):
     whole_lines = read_lines(undisturbed_scan.path / "manifest.jsonl")
     offset = len(b"".join(whole_lines[:record]))
-    for bit in sample(range(8 * len(whole_lines[record])), 8):
+    for bit in draw_cases(range(8 * len(whole_lines[record])), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / "manifest.jsonl", 8 * offset + bit)
         # Without its line end this line and the next are one.
@@ -109,12 +109,12 @@ def list_event_ends(raw: bytes) -> list[int]:
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
-def test_an_event_log_that_was_cut_is_completed_from_the_journal(undisturbed_scan, tmp_path, sample, record, tail):
+def test_an_event_log_that_was_cut_is_completed_from_the_journal(undisturbed_scan, tmp_path, draw_cases, record, tail):
     """Events that the host has lost come from the Pi's journal; no row is retaken."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     start = list_event_ends(raw)[-1 - record]
     stop = list_event_ends(raw)[-record]
-    for cut in sample(range(start, stop), 8):
+    for cut in draw_cases(range(start, stop), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "events.msgpack").write_bytes(raw[:cut] + tail)
         if record == 1:
@@ -126,11 +126,11 @@ def test_an_event_log_that_was_cut_is_completed_from_the_journal(undisturbed_sca
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
 
 
-def test_a_flipped_bit_of_the_event_log_is_reported(undisturbed_scan, tmp_path, sample):
+def test_a_flipped_bit_of_the_event_log_is_reported(undisturbed_scan, tmp_path, draw_cases):
     """The digest shows it if the log can still be read; otherwise the events come from the journal again."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     committed = load_facts(undisturbed_scan.path, "row_committed")[-1]["events"]["bytes"]
-    for bit in sample(range(8 * committed), 16):
+    for bit in draw_cases(range(8 * committed), 16):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / "events.msgpack", bit)
         events = (scan.path / "events.msgpack").read_bytes()
@@ -147,7 +147,7 @@ def test_a_flipped_bit_of_the_event_log_is_reported(undisturbed_scan, tmp_path, 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
 def test_after_a_cut_of_the_journal_the_sequence_continues_after_the_host_s_last_event(
-    undisturbed_scan, tmp_path, sample, record, tail
+    undisturbed_scan, tmp_path, draw_cases, record, tail
 ):
     path = find_journal(undisturbed_scan)
     with path.open("rb") as file:
@@ -155,17 +155,17 @@ def test_after_a_cut_of_the_journal_the_sequence_continues_after_the_host_s_last
     raw = path.read_bytes()
     start = starts[-record]
     stop = [*starts, len(raw)][len(starts) - record + 1]
-    for cut in sample(range(start, stop), 8):
+    for cut in draw_cases(range(start, stop), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
         find_journal(scan).write_bytes(raw[:cut] + tail)
         check_resumed_journal(scan, undisturbed_scan, lost=record)
 
 
-def test_after_a_flipped_bit_of_the_journal_the_events_before_it_are_kept(undisturbed_scan, tmp_path, sample):
+def test_after_a_flipped_bit_of_the_journal_the_events_before_it_are_kept(undisturbed_scan, tmp_path, draw_cases):
     path = find_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
-    for bit in sample(range(8 * starts[0], 8 * path.stat().st_size), 16):
+    for bit in draw_cases(range(8 * starts[0], 8 * path.stat().st_size), 16):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(find_journal(scan), bit)
         check_resumed_journal(scan, undisturbed_scan, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
@@ -201,11 +201,11 @@ def check_resumed_journal(scan: SmallScan, undisturbed_scan, lost: int, rows: se
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
-def test_a_committed_row_that_was_cut_is_refused_and_retaken(undisturbed_scan, tmp_path, sample, suffix):
+def test_a_committed_row_that_was_cut_is_refused_and_retaken(undisturbed_scan, tmp_path, draw_cases, suffix):
     """`validate` names its file, so that damaged rows are never imaged."""
     name = f"raw/RV/0001{suffix}"
     raw = (undisturbed_scan.path / name).read_bytes()
-    for cut in sample([*range(0, len(raw) - PACKET, 97), *range(max(0, len(raw) - PACKET), len(raw))], 6):
+    for cut in draw_cases([*range(0, len(raw) - PACKET, 97), *range(max(0, len(raw) - PACKET), len(raw))], 6):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / name).write_bytes(raw[:cut])
         assert [name in f for f in list_faults(scan)] == [True]
@@ -220,9 +220,9 @@ def test_a_committed_row_that_was_cut_is_refused_and_retaken(undisturbed_scan, t
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
-def test_a_committed_row_with_a_flipped_bit_is_retaken(undisturbed_scan, tmp_path, sample, suffix):
+def test_a_committed_row_with_a_flipped_bit_is_retaken(undisturbed_scan, tmp_path, draw_cases, suffix):
     name = f"raw/RH/0002{suffix}"
-    for bit in sample(range(8 * (undisturbed_scan.path / name).stat().st_size), 4):
+    for bit in draw_cases(range(8 * (undisturbed_scan.path / name).stat().st_size), 4):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / name, bit)
         assert [name in f for f in list_faults(scan)] == [True]
@@ -231,11 +231,11 @@ def test_a_committed_row_with_a_flipped_bit_is_retaken(undisturbed_scan, tmp_pat
 
 @pytest.mark.parametrize("suffix", [".part", ".bin", ".idx"])
 def test_files_of_a_row_that_is_not_committed_are_replaced_whatever_they_have(
-    undisturbed_scan, tmp_path, sample, suffix
+    undisturbed_scan, tmp_path, draw_cases, suffix
 ):
     whole_lines = read_lines(undisturbed_scan.path / "manifest.jsonl")
     raw = (undisturbed_scan.path / f"raw/RV/0002{suffix.replace('part', 'bin')}").read_bytes()
-    for cut in sample(range(len(raw)), 4):
+    for cut in draw_cases(range(len(raw)), 4):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(b"".join(whole_lines[:-2]))
         (scan.path / f"raw/RV/0002{suffix}").write_bytes(raw[:cut])

@@ -65,12 +65,12 @@ def list_disk_operations(samples: Samples, folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("fault", ["killed", "killed within", "power cut"])
-def test_a_scan_that_was_killed_at_any_operation_resumes(samples, undisturbed_scan, tmp_path, fault, sample):
+def test_a_scan_that_was_killed_at_any_operation_resumes(samples, undisturbed_scan, tmp_path, fault, draw_cases):
     operations = list_disk_operations(samples, tmp_path / "count")
     # The operations were recorded.
     assert len(operations) > 100
     draws = POWER_CUTS if fault == "power cut" else 1
-    for step, seed in sample([(step, seed) for step in range(1, len(operations) + 1) for seed in range(draws)], 12):
+    for step, seed in draw_cases([(step, seed) for step in range(1, len(operations) + 1) for seed in range(draws)], 12):
         folder = tmp_path / f"{step}-{seed}"
         scan = SmallScan(samples, folder)
         folder.mkdir()
@@ -102,13 +102,13 @@ def test_a_scan_that_lost_all_unsynced_data_resumes(samples, undisturbed_scan, t
 
 @pytest.mark.parametrize("fault", ["killed within", "power cut"])
 def test_a_resumed_scan_that_is_killed_at_any_operation_resumes_again(
-    samples, undisturbed_scan, tmp_path, fault, sample
+    samples, undisturbed_scan, tmp_path, fault, draw_cases
 ):
     operations = list_disk_operations(samples, tmp_path / "count")
     # The first kill is within row 1.
     first = next(i for i, description in enumerate(operations, 1) if description == "write 0001.idx")
     killed = 0
-    for position in sample(range(1, len(operations)), 12):
+    for position in draw_cases(range(1, len(operations)), 12):
         folder = tmp_path / str(position)
         folder.mkdir()
         scan = SmallScan(samples, folder)

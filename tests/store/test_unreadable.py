@@ -1,4 +1,8 @@
-"""Read errors of the disk are errors, never a reason to retake a row; a disk without locks is not a scan in use."""
+"""Errors of the disk are reported as such, and no recorded row is lost.
+
+A row that cannot be read now is not retaken, an error of a lock does not mean that the scan is in use, and a scan whose
+disk was full can be resumed.
+"""
 
 import errno
 import os
@@ -19,7 +23,7 @@ from polysight.store.validation import validate
 from polysight_shared.errors import ErrorCode, PolysightError
 
 
-def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):
+def test_an_error_of_a_lock_is_not_reported_as_a_scan_in_use(tmp_path, monkeypatch):
     path = tmp_path / "manifest.jsonl"
     ManifestWriter(path, create=True).close()
 
@@ -75,10 +79,10 @@ def test_a_row_without_its_file_is_taken_again(undisturbed_scan, monkeypatch):
     assert list(validation.find_damaged_rows(scan)) == [1]
 
 
-def list_operations_that_need_space(samples: Samples, folder: Path, disk_of: str) -> list[int]:
-    """Return the numbers of the disk operations of a scan that need space."""
+def list_operations_that_need_space(samples: Samples, folder: Path, subfolder: str) -> list[int]:
+    """Return the numbers of those disk operations of a scan in this subfolder that need space."""
     folder.mkdir()
-    disk = FaultyDisk(folder / disk_of)
+    disk = FaultyDisk(folder / subfolder)
     with disk():
         SmallScan(samples, folder).run()
     return [i for i, description in enumerate(disk.done, 1) if description.split()[0] in NEED_SPACE]
@@ -94,17 +98,19 @@ def run_on_disk(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
     return None
 
 
+# From the drawn operation on, the disk is full. With "short", half of its bytes are still written.
 @pytest.mark.parametrize("fault", ["full", "short"])
-@pytest.mark.parametrize("disk_of", ["scan", "journal"])
+@pytest.mark.parametrize("full_subfolder", ["scan", "journal"])
 def test_a_full_disk_is_an_error_and_no_committed_row_is_lost(
-    samples, undisturbed_scan, tmp_path, sample, fault, disk_of
+    samples, undisturbed_scan, tmp_path, draw_cases, fault, full_subfolder
 ):
     failures = 0
-    for position in sample(list_operations_that_need_space(samples, tmp_path / "count", disk_of), 10):
-        folder = tmp_path / str(position)
+    operations = list_operations_that_need_space(samples, tmp_path / "count", full_subfolder)
+    for operation in draw_cases(operations, 10):
+        folder = tmp_path / str(operation)
         folder.mkdir()
         scan = SmallScan(samples, folder)
-        error = run_on_disk(scan, FaultyDisk(folder / disk_of, fault, position))
+        error = run_on_disk(scan, FaultyDisk(folder / full_subfolder, fault, at=operation))
         if error is not None:
             failures += 1
             assert os.strerror(errno.ENOSPC) in error.what
@@ -120,13 +126,15 @@ def test_a_full_disk_is_an_error_and_no_committed_row_is_lost(
         assert scan.rows() == undisturbed_scan.digests
         assert committed_rows.items() <= undisturbed_scan.digests.items()
         shutil.rmtree(folder)
-    # Most of the ten positions: some operations do without the space.
+    # Most of the ten scans end with an error. The others finish, although one of their operations found no space.
     assert failures > 5
 
 
 def test_a_line_that_the_full_disk_did_not_take_is_not_written_when_there_is_space_again(samples, tmp_path):
     """Bytes that one call could not write are not written by a later call."""
-    disk = FaultyDisk(tmp_path, "short", at=10**6)
+    # More operations than the test has: the disk is not full until `at` is changed.
+    never = 10**6
+    disk = FaultyDisk(tmp_path, "short", at=never)
     scan = SmallScan(samples, tmp_path)
     scan.run()
     folder = ScanFolder.load(scan.path)

@@ -16,6 +16,7 @@ from polysight_shared.errors import DataError, DeviceError, ErrorCode
 
 OLD = {"image.npz": b"old", "report.html": b"old page", "figures/h.png": b"old h", "figures/p.png": b"old p"}
 NEW = {"image.npz": b"new", "quality.json": b"{}", "figures/h.png": b"new h"}
+SCAN_ID = "s"
 
 
 def write(folder: Path, files: dict[str, bytes]) -> None:
@@ -29,7 +30,7 @@ def read(folder: Path) -> dict[str, bytes]:
 
 
 def replace(out: Path) -> None:
-    with replace_products(out, "s") as new:
+    with replace_products(out, SCAN_ID) as new:
         write(new, NEW)
 
 
@@ -64,7 +65,7 @@ def test_an_error_leaves_the_old_products(out, error):
         write(new, NEW)
         raise error
 
-    with pytest.raises(type(error)), replace_products(out, "s") as new:
+    with pytest.raises(type(error)), replace_products(out, SCAN_ID) as new:
         fail(new)
     assert read(out) == OLD
     assert list(out.parent.iterdir()) == [out]
@@ -78,32 +79,34 @@ class Killed(BaseException):
 @pytest.mark.parametrize("step", range(20))
 def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, exchange, step, monkeypatch):
     """With an atomic swap the folder holds old or new products at every moment, otherwise from the next run on."""
-    steps_left = iter(range(step, -1, -1))
+    steps_done = 0
 
-    def die_at_step(call):
-        """The same function, which counts a step and ends the program if it is the last one, and after it."""
+    def count_step(call):
+        """The same function; each call is a step, and the program is killed once `step` of them were done."""
 
-        def dying(*args, **kwargs):
-            if next(steps_left, 0) == 0:
+        def call_or_die(*args, **kwargs):
+            nonlocal steps_done
+            if steps_done == step:
                 raise Killed
+            steps_done += 1
             return call(*args, **kwargs)
 
-        return dying
+        return call_or_die
 
     with monkeypatch.context() as patched, suppress(Killed):
         for owner, name in (
             (Path, "mkdir"), (Path, "rename"), (Path, "write_bytes"), (Path, "unlink"), (shutil, "rmtree"),
             (products_folder, "_exchange"), (products_folder, "sync_folder"), (fcntl, "flock"),
         ):  # fmt: skip
-            patched.setattr(owner, name, die_at_step(getattr(owner, name)))
+            patched.setattr(owner, name, count_step(getattr(owner, name)))
         replace(out)
     if exchange == "one step":
         assert read(out) in (OLD, NEW)
-    # A run that fails after it has begun leaves what it found.
+    # The next run only looks at the folder. It ends with an error, so that it replaces nothing.
     found_by_next_run = {}
-    with suppress(DataError), replace_products(out, "s"):
+    with suppress(DataError), replace_products(out, SCAN_ID):
         found_by_next_run = read(out)
-        raise DataError("nothing")
+        raise DataError("only looked")
     assert found_by_next_run in (OLD, NEW)
     replace(out)
     assert read(out) == NEW
@@ -112,13 +115,14 @@ def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, ex
 
 @pytest.mark.usefixtures("exchange")
 def test_hidden_files_of_other_programs_are_kept(out):
+    """The settings of the old products (.finished.json) and a half-written file (.part) are not of other programs."""
     write(out, {".gitignore": b"*", ".finished.json": b"{}", ".image.npz.part": b"torn"})
     replace(out)
     assert read(out) == {**NEW, ".gitignore": b"*"}
 
 
 def test_a_second_program_is_refused(out):
-    with replace_products(out, "s") as new:
+    with replace_products(out, SCAN_ID) as new:
         write(new, NEW)
         with expect_refusal(ErrorCode.BUSY, out):
             replace(out)
@@ -136,20 +140,21 @@ def test_a_link_stays_a_link(out):
 def test_a_folder_that_must_not_be_replaced_is_refused(out, monkeypatch):
     write(out.parent / "thesis", {"thesis.tex": b"precious"})
     with expect_refusal(ErrorCode.FILE_EXISTS, "thesis.tex"):
-        check_products_folder(out.parent / "thesis", "s")
+        check_products_folder(out.parent / "thesis", SCAN_ID)
     for path in (out / "image.npz", out / "image.npz" / "deeper"):
         with expect_refusal(ErrorCode.FILE_UNREADABLE, path):
-            check_products_folder(path, "s")
+            check_products_folder(path, SCAN_ID)
     with monkeypatch.context() as mounted:
         mounted.setattr(Path, "is_mount", lambda path: path == out)
         with expect_refusal(ErrorCode.VALUE_INVALID, out):
-            check_products_folder(out, "s")
+            check_products_folder(out, SCAN_ID)
     monkeypatch.chdir(out)
     with expect_refusal(ErrorCode.VALUE_INVALID):
-        check_products_folder(Path(), "s")
+        check_products_folder(Path(), SCAN_ID)
 
 
-def test_the_only_products_of_a_scan_are_not_replaced_by_those_of_another(out):
+def test_products_of_a_scan_whose_raw_data_was_deleted_are_not_replaced_by_those_of_another(out):
+    """Such products cannot be made again: `raw_dropped` says when the raw data of which scan was deleted."""
     write_json(out / "quality.json", {"raw_dropped": {"scan_id": "first", "dropped_utc": "2026-01-02T03:04:05"}})
     contents_before = read(out)
     with expect_refusal(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), replace_products(out, "second"):

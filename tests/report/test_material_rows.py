@@ -10,12 +10,14 @@ from polysight.cli.main import main
 from polysight.imaging import Images
 from polysight.products import write_image, write_json
 
+# The decimals do not end: a file that rounds the number has another one.
+PERMITTIVITY_REAL = 1 / 3 + 3.5
 PATCH = {
     "label": 4, "name": 'PET, "0.5 mm"', "name_source": "library",
     "confidence": 0.75, "metal_reference": False, "metal_like": True,
     "box_mm": [10.0, -20.0, 50.0, 40.0], "outline_mm": [], "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5,
     "ratio": {"real": 0.0, "imag": 10.0}, "inverse_ratio_std": 0.004,
-    "permittivity": {"real": 1 / 3 + 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125,
+    "permittivity": {"real": PERMITTIVITY_REAL, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125,
                      "covariance": [[0.0625**2, -0.002], [-0.002, 0.125**2]], "half_widths_68": [0.05, 0.09375],
                      "dominated_by": "leakage"},
     "truth": {"name": "vinyl", "permittivity": {"real": 3.75, "imag": -0.5}},
@@ -26,7 +28,7 @@ METAL = {
     "ratio": None, "inverse_ratio_std": None, "permittivity": None, "truth": None, "box": "copper foil",
     "refused": {"what": "noise", "why": "nothing reflects", "do": "look at the image"},
 }  # fmt: skip
-# Columns of the table of both patches.
+# Each column of the table has the values of both patches.
 EXPECTED = {
     "patch": [4, 5],
     "name": ['PET, "0.5 mm"', None],
@@ -38,9 +40,10 @@ EXPECTED = {
     "centre_y_mm": [10.0, 3.0],
     "width_mm": [40.0, 4.0],
     "height_mm": [60.0, 2.0],
+    # The pixels behind the result: `interior_pixels`, without those at the edge of the patch.
     "pixels": [77, 7],
     "incidence_deg": [54.5, 55.0],
-    "permittivity_real": [1 / 3 + 3.5, None],
+    "permittivity_real": [PERMITTIVITY_REAL, None],
     "permittivity_real_standard_error": [0.0625, None],
     "permittivity_loss": [0.25, None],
     "permittivity_loss_standard_error": [0.125, None],
@@ -50,6 +53,7 @@ EXPECTED = {
     "permittivity_loss_half_width_68": [0.09375, None],
     "dominated_by": ["leakage", None],
     "refused": [None, "noise: nothing reflects; look at the image"],
+    # P is the complex `ratio` of the channels, 10j.
     "p_real": [0.0, None],
     "p_imag": [10.0, None],
     "p_abs_db": [20.0, None],
@@ -58,6 +62,7 @@ EXPECTED = {
     "true_name": ["vinyl", None],
     "true_permittivity_real": [3.75, None],
     "true_permittivity_loss": [0.5, None],
+    # The name that the operator gave to a drawn box: `box`.
     "drawn_as": [None, "copper foil"],
 }
 

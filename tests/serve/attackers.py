@@ -1,5 +1,6 @@
 """Concurrent clients of a server, as a program: `PORT STREAMS READERS WRONG_TOKENS CONNECTIONS ABORTS VIEWS`.
 
+`Attack` in test_attack.py describes these numbers; VIEWS is the number of scans that have a live view.
 Every second a line says how many connections were opened in all, and how many requests were reset before their answer.
 """
 
@@ -16,6 +17,15 @@ import time
 from collections import Counter
 from multiprocessing.sharedctypes import Synchronized
 
+# Pause before a client opens a lost live view again, seconds.
+STREAM_RETRY_S = 0.2
+# Longest pause of a reader between two answers, and its pause before it connects again, seconds.
+LONGEST_READ_PAUSE_S = 0.02
+READER_RETRY_S = 0.05
+# Each client with a wrong token tries at most ten times a second.
+GUESS_PAUSE_S = 0.1
+# Pause if no connection is due, seconds; at 1000 connections a second two are due after it.
+CONNECTION_PAUSE_S = 0.002
 # What pages read, with the number of a scan.
 PATHS = ("scans", "scan?scan=s{}", "result?scan=s{}", "map/h_amplitude?scan=s{}", "running")
 counted: Counter[str] = Counter()
@@ -31,23 +41,23 @@ async def read_stream(port: int, scan: int) -> None:
                 pass
         except OSError:
             counted["streams lost"] += 1
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(STREAM_RETRY_S)
 
 
-async def read_pages(port: int, views: int) -> None:
-    """Send one request after another, as pages do."""
+async def read_pages(port: int, scan_count: int) -> None:
+    """Request one page after another, each of a scan drawn by chance."""
     while True:
         try:
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
             may_ask = True
             while may_ask:
-                path = random.choice(PATHS).format(random.randrange(views + 1))
+                path = random.choice(PATHS).format(random.randrange(scan_count))
                 may_ask = await ask(reader, writer, f"GET /api/{path} HTTP/1.1\r\nHost: localhost\r\n\r\n")
-                await asyncio.sleep(0.02 * random.random())
+                await asyncio.sleep(LONGEST_READ_PAUSE_S * random.random())
             writer.close()
         except (OSError, asyncio.IncompleteReadError):
             counted["reads lost"] += 1
-        await asyncio.sleep(0.05)
+        await asyncio.sleep(READER_RETRY_S)
 
 
 async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, request: str) -> bool:
@@ -72,7 +82,7 @@ async def guess_token(port: int, scan: int) -> None:
             writer.close()
         except (OSError, asyncio.IncompleteReadError):
             counted["wrong tokens lost"] += 1
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(GUESS_PAUSE_S)
 
 
 def open_connections(port: int, rate: int, opened: Synchronized[int]) -> None:
@@ -86,7 +96,7 @@ def open_connections(port: int, rate: int, opened: Synchronized[int]) -> None:
                 opened.value += 1
         else:
             # As many connections as are due were opened.
-            time.sleep(0.002)
+            time.sleep(CONNECTION_PAUSE_S)
 
 
 async def report(opened: Synchronized[int]) -> None:
@@ -102,9 +112,12 @@ async def main() -> None:
     """Run all clients until the process is ended."""
     # The sixth argument, the number of aborts, is for the test that sends them.
     port, streams, readers, wrong_tokens, connections, _, views = map(int, sys.argv[1:])
+    # The first scans have live views; the test aborts the one after these.
+    aborted_scan = views
+    scan_count = views + 1
     clients = [read_stream(port, k % views) for k in range(streams)]
-    clients += [read_pages(port, views) for _ in range(readers)]
-    clients += [guess_token(port, views) for _ in range(wrong_tokens)]
+    clients += [read_pages(port, scan_count) for _ in range(readers)]
+    clients += [guess_token(port, aborted_scan) for _ in range(wrong_tokens)]
     opened = multiprocessing.Value("i", 0)
     multiprocessing.Process(target=open_connections, args=(port, connections, opened), daemon=True).start()
     await asyncio.gather(*clients, report(opened))

@@ -284,8 +284,7 @@ def test_error_bars_contain_paint_that_is_not_certain():
         probabilities.append(result.painted)
         is_covered += [distance < CHI2_95 for distance in compute_distances(result, eps)]
     # The probabilities are 0.30 to 0.75.
-    assert min(probabilities) > 0.05
-    assert max(probabilities) < 0.95
+    assert 0.05 < min(probabilities) < max(probabilities) < 0.95
     # 95 % are expected; of 32 plates two standard deviations less: sqrt(0.95 * 0.05 / 32) = 0.039.
     assert np.mean(is_covered) > 0.87
 

@@ -138,6 +138,33 @@ def test_of_several_takes_of_a_row_the_last_is_read(whole_scan):
     assert len(scan.committed_rows()) == 4
 
 
+class RowsThatGrow(dict):
+    """Committed rows of a manifest to which another thread adds `line` just after they were first copied."""
+
+    content: manifest.Manifest
+    line: bytes
+
+    def copy(self) -> dict:
+        rows = dict(self)
+        if self.line:
+            line = self.line
+            self.line = b""
+            self.content.feed(line)
+        return rows
+
+
+def test_a_row_that_is_committed_while_rows_are_read_is_there_at_the_next_reading(whole_scan):
+    lines = (whole_scan / "manifest.jsonl").read_bytes().splitlines(keepends=True)
+    (number_of_last_row,) = [n for n, line in enumerate(lines) if b'"row_committed"' in line and b'"row":3,' in line]
+    content = parse(b"".join(lines[:number_of_last_row]))
+    scan = ScanFolder(whole_scan, content)
+    content.rows = RowsThatGrow(content.rows)
+    content.rows.content = content
+    content.rows.line = lines[number_of_last_row]
+    assert list(scan.committed_rows()) == [0, 1, 2]
+    assert list(scan.committed_rows()) == [0, 1, 2, 3]
+
+
 def flip(path: Path, offset: int = 50) -> None:
     """Flip one bit of the byte at `offset` from the start of the file; negative: from its end."""
     raw = bytearray(path.read_bytes())

@@ -238,7 +238,7 @@ class Scan:
 
     @property
     def simulated(self) -> bool | None:
-        """True if the data is simulated; None if the products do not say so or otherwise."""
+        """True if the data is simulated; None if the products do not say."""
         return self._origin.simulated
 
     @property

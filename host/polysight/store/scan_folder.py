@@ -25,7 +25,7 @@ from datetime import UTC, datetime
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,6 +170,14 @@ def _release(package: str) -> str:
         return "not installed"
 
 
+class _CachedRows(NamedTuple):
+    """Committed rows by index, with the manifest that they were read from and its number of facts just before."""
+
+    content: Manifest
+    facts: int
+    rows: dict[int, RowCommitted]
+
+
 class ScanFolder:
     """A scan on disk. Construct with :meth:`create` or :meth:`load`; :meth:`writer` opens it for appending.
 
@@ -185,9 +193,8 @@ class ScanFolder:
     def __init__(self, path: Path, content: Manifest) -> None:
         self.path = path
         self.content = content
-        # The committed rows as they were last read, with the manifest and its number of facts at that time.
-        self._rows: dict[int, RowCommitted] = {}
-        self._rows_read_at: tuple[Manifest | None, int] = (None, 0)
+        # One value, because several threads read it; None before the first reading.
+        self._cached_rows: _CachedRows | None = None
         for number, fact in content.problems:
             if fact.kind == "scan_started":
                 raise self._unreadable_error(number, fact)
@@ -299,17 +306,21 @@ class ScanFolder:
 
         Raises DataError if a committed row cannot be read.
         """
-        manifest_then, facts_then = self._rows_read_at
-        if manifest_then is not self.content or facts_then != len(self.content.facts):
-            for number, fact in self.content.problems:
+        # Another thread may add a row meanwhile: first the row, then its fact. Therefore facts are counted before the rows
+        # are copied: a row that comes after the copy changes the number of facts, and is found at the next reading.
+        content = self.content
+        facts = len(content.facts)
+        cached = self._cached_rows
+        if cached is None or cached.content is not content or cached.facts != facts:
+            for number, fact in content.problems:
                 if fact.kind in ("row_committed", "row_withdrawn"):
                     raise self._unreadable_error(number, fact)
             for fact in self.facts(RowCommitted):
                 for board in fact.boards.values():
                     check_inside(self.path, board.file, "raw")
-            self._rows = dict(sorted(self.content.rows.copy().items()))
-            self._rows_read_at = (self.content, len(self.content.facts))
-        return self._rows
+            cached = _CachedRows(content, facts, rows=dict(sorted(content.rows.copy().items())))
+            self._cached_rows = cached
+        return cached.rows
 
     @property
     def manifest_faults(self) -> tuple[Finding, ...]:

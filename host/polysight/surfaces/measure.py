@@ -233,13 +233,13 @@ class SlopeFit:
     def __init__(self, d: Array, *, may_change: bool) -> None:
         x, y = d.T
         zero = np.zeros(len(d))
-        one = np.ones(len(d))
+        ones = np.ones(len(d))
         # Unknowns: g_x, g_y, Q_xx, Q_xy, Q_yy; dQ_xx/dx, dQ_xx/dy = dQ_xy/dx, dQ_xy/dy = dQ_yy/dx, dQ_yy/dy.
-        slope_x = [one, zero, x, y, zero, x * x / 2, x * y, y * y / 2, zero]
-        slope_y = [zero, one, zero, x, y, zero, x * x / 2, x * y, y * y / 2]
-        bend_xx = [zero, zero, one, zero, zero, x, y, zero, zero]
-        bend_xy = [zero, zero, zero, one, zero, zero, x, y, zero]
-        bend_yy = [zero, zero, zero, zero, one, zero, zero, x, y]
+        slope_x = [ones, zero, x, y, zero, x * x / 2, x * y, y * y / 2, zero]
+        slope_y = [zero, ones, zero, x, y, zero, x * x / 2, x * y, y * y / 2]
+        bend_xx = [zero, zero, ones, zero, zero, x, y, zero, zero]
+        bend_xy = [zero, zero, zero, ones, zero, zero, x, y, zero]
+        bend_yy = [zero, zero, zero, zero, ones, zero, zero, x, y]
         # [equation, window, unknown]
         rows = np.moveaxis(np.array([slope_x, slope_y, bend_xx, bend_xy, bend_yy]), 1, 2)
         if not may_change:

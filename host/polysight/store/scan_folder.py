@@ -306,8 +306,8 @@ class ScanFolder:
 
         Raises DataError if a committed row cannot be read.
         """
-        # Another thread may add a row meanwhile: first the row, then its fact. Therefore facts are counted before the rows
-        # are copied: a row that comes after the copy changes the number of facts, and is found at the next reading.
+        # Another thread may add a row meanwhile: first the row, then its fact. Therefore facts are counted before the
+        # rows are copied: a row that comes after the copy changes the number of facts, and is found the next time.
         content = self.content
         facts = len(content.facts)
         cached = self._cached_rows
